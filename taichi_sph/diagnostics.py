@@ -1,0 +1,41 @@
+"""What a frame says about the state of the blood."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Figures of one frame."""
+
+    time: float
+    """Simulated time [s]."""
+    step: float
+    """Last time step [s]."""
+    particles: int
+    """Live blood particles."""
+    drained: dict[str, int]
+    """Particles that have left, by opening."""
+    drained_volume: float
+    """Volume that has left through openings [m^3]."""
+    leaks: int
+    """Particles outside the lumen that no opening explains, with those lost for good."""
+    wall_corrections: int
+    """How often the wall's last defence has acted since the start."""
+    compression_p99: float
+    """99th percentile of max(rho/rho_0 - 1, 0)."""
+    compression_max: float
+    """Largest of the same."""
+    kinetic_energy: float
+    """Sum of m v^2/2 [J]."""
+    max_speed: float
+    """Largest speed [m/s]."""
+
+
+def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]:
+    """99th percentile and largest of max(rho/rho_0 - 1, 0)."""
+    if not len(density):
+        return 0.0, 0.0
+    excess = np.maximum(density / rest_density - 1.0, 0.0)
+    return float(np.percentile(excess, 99)), float(excess.max())

@@ -1,0 +1,88 @@
+"""Kick, drift, and the last defence of the wall."""
+
+import taichi as ti
+
+WALL_MARGIN = 0.1
+"""Blood may come this close to the lumen surface [setbacks]; at rest it keeps one setback."""
+
+WALL_SIDE = 0.5
+"""A proxy guards only blood that was on its side before the step, to this depth [setbacks]:
+behind a thin septum lies another branch, whose blood must not be pulled over."""
+
+
+@ti.func
+def is_finite(a):
+    """Whether a number is neither NaN nor infinite, from its bits: fast math may not be asked."""
+    finite = True
+    if ti.static(a.ptr.get_rvalue_type() == ti.f64):
+        finite = (ti.bit_cast(a, ti.i64) >> 52) & 0x7FF != 0x7FF
+    else:
+        finite = (ti.bit_cast(a, ti.i32) >> 23) & 0xFF != 0xFF
+    return finite
+
+
+@ti.kernel
+def survey(p: ti.template()) -> ti.math.vec3:
+    """Largest speed [m/s], largest acceleration [m/s^2], number of non-finite particles."""
+    speed2 = 0.0
+    acceleration2 = 0.0
+    broken = 0.0
+    for i in range(p.count[None]):
+        v2 = p.velocity[i].norm_sqr()
+        a2 = p.acceleration[i].norm_sqr()
+        if not (is_finite(v2) and is_finite(a2)):
+            broken += 1.0
+        ti.atomic_max(speed2, v2)
+        ti.atomic_max(acceleration2, a2)
+    return ti.Vector([ti.sqrt(speed2), ti.sqrt(acceleration2), broken])
+
+
+@ti.kernel
+def kick_drift(
+    p: ti.template(), w: ti.template(), nb: ti.template(), printed: ti.template(), dt: float
+) -> ti.math.vec2:
+    """Advance velocity and position by dt [s], then keep blood inside the wall.
+
+    v' = v + a dt (Eq. 17), x' = x + v' dt: symplectic Euler.  `printed` takes Eq. 18 as printed,
+    x' = x + (v + v')/2 dt, which amplifies sound at every step (determinant 1 + (w dt)^2/2).
+
+    The wall's last defence: blood that comes nearer to the lumen surface than WALL_MARGIN
+    setbacks is put back on that distance along the normal of the proxies beside it, and its
+    velocity into the wall is taken away.  The pressure of the wall holds blood that is packed;
+    this holds a lone drop, which has no pressure.
+
+    Returns the largest squared distance from where the lists were built [m^2] and the number of
+    particles put back.
+    """
+    moved2 = 0.0
+    corrected = 0.0
+    for i in range(p.count[None]):
+        v = p.velocity[i]
+        v_new = v + p.acceleration[i] * dt
+        x = p.position[i]
+        x_old = x
+        if ti.static(printed):
+            x += 0.5 * (v + v_new) * dt
+        else:
+            x += v_new * dt
+        near2 = ti.static((0.75 * w.spacing) ** 2)
+        limit = ti.static(-(1.0 + WALL_MARGIN) * w.setback)
+        side = ti.static(-(1.0 - WALL_SIDE) * w.setback)
+        touched = 0
+        for n in range(nb.wall_count[i]):
+            k = nb.wall_index[i, n]
+            r_ik = nb.grid.separation(x, w.position[k])
+            normal = w.normal[k]
+            depth = r_ik.dot(normal)
+            before = nb.grid.separation(x_old, w.position[k]).dot(normal)
+            # Only proxies straight behind the particle: their plane is the wall there.
+            beside = r_ik.norm_sqr() - depth * depth < near2
+            if depth > limit and before < side and beside:
+                x -= (depth - limit) * normal
+                v_new -= ti.max(0.0, v_new.dot(normal)) * normal
+                touched = 1
+        corrected += ti.cast(touched, float)
+        p.velocity[i] = v_new
+        ti.atomic_max(moved2, nb.grid.separation(x, nb.built_position[i]).norm_sqr())
+        p.position[i] = nb.grid.wrap(x)
+    return ti.Vector([moved2, corrected])

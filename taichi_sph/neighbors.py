@@ -1,0 +1,364 @@
+"""Neighbours: a cell grid, particles sorted by cell, and lists with a skin.
+
+Blood is sorted by cell and, inside a cell, by identity, so that sums run in one order and two
+runs agree bitwise.  Lists hold what lies within R + skin when they are built and stay valid
+until some particle has moved half the skin; proxies never move and are sorted once.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from taichi_sph.errors import RunError
+from taichi_sph.particles import Particles
+from taichi_sph.wall import Wall
+
+ROW_MULTIPLE = 8
+
+
+@ti.data_oriented
+@dataclass(frozen=True)
+class Grid:
+    """Cells of one edge over a box, each axis walled or periodic."""
+
+    lower: tuple[float, float, float]
+    """Lower corner of the box [m]."""
+    cell: tuple[float, float, float]
+    """Edge of a cell along each axis [m]."""
+    shape: tuple[int, int, int]
+    """Number of cells along each axis."""
+    period: tuple[float, float, float]
+    """Length after which an axis repeats [m]; 0 where it does not."""
+    reach: int
+    """Cells to look at on each side."""
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return math.prod(self.shape)
+
+    @property
+    def periodic(self) -> bool:
+        """Whether any axis repeats."""
+        return any(self.period)
+
+    @ti.func
+    def cell_of(self, x):
+        """Cell of a position, clamped to the box."""
+        c = ti.Vector([0, 0, 0])
+        for a in ti.static(range(3)):
+            k = ti.floor((x[a] - self.lower[a]) / self.cell[a], int)
+            c[a] = ti.max(0, ti.min(self.shape[a] - 1, k))
+        return c
+
+    @ti.func
+    def index(self, c):
+        """Linear index of a cell; cells that follow along z are neighbours in memory."""
+        return (c[0] * self.shape[1] + c[1]) * self.shape[2] + c[2]
+
+    @ti.func
+    def separation(self, x_i, x_j):
+        """r_ij = x_i - x_j [m], to the nearest image where an axis is periodic."""
+        r = x_i - x_j
+        for a in ti.static(range(3)):
+            if ti.static(self.period[a] > 0.0):
+                r[a] -= self.period[a] * ti.round(r[a] / self.period[a])
+        return r
+
+    @ti.func
+    def wrap(self, x):
+        """A position moved back into the box along periodic axes."""
+        for a in ti.static(range(3)):
+            if ti.static(self.period[a] > 0.0):
+                x[a] -= self.period[a] * ti.floor((x[a] - self.lower[a]) / self.period[a])
+        return x
+
+
+def make_grid(
+    lower: np.ndarray,
+    upper: np.ndarray,
+    radius: float,
+    period: np.ndarray | None = None,
+    reach: int = 2,
+) -> Grid:
+    """A grid over the box lower..upper [m] for lists of a radius [m].
+
+    Cells of half the radius: a third fewer candidates than cells of the radius.
+    """
+    period = np.zeros(3) if period is None else np.asarray(period, dtype=float)
+    extent = np.where(period > 0.0, period, np.asarray(upper) - np.asarray(lower))
+    edge = radius / reach
+    if np.any((period > 0.0) & (period < (2 * reach + 1) * edge)):
+        raise ValueError("a periodic axis must be at least three list radii long")
+    shape = np.maximum(1, np.floor(extent / edge * (1.0 + 1e-9))).astype(int)
+    shape = np.where(period > 0.0, shape, shape + 1)
+    cell = np.where(period > 0.0, extent / shape, edge)
+    if float(np.prod(shape.astype(float))) > 2e8:
+        raise RunError(
+            f"the neighbour grid would need {np.prod(shape.astype(float)):.2g} cells: the vessel "
+            f"is too large for this spacing; at most 2e8 are allowed"
+        )
+    return Grid(
+        tuple(float(v) for v in lower),
+        tuple(float(v) for v in cell),
+        tuple(int(v) for v in shape),
+        tuple(float(v) for v in period),
+        reach,
+    )
+
+
+def list_capacity(expected: float) -> int:
+    """Slots a list gets for an expected number of entries; half as many again, and sixteen."""
+    return ROW_MULTIPLE * math.ceil((1.5 * expected + 16) / ROW_MULTIPLE)
+
+
+@dataclass(eq=False)
+class Neighbors:
+    """Neighbour lists of the blood: blood_index[i, :blood_count[i]], likewise for proxies.
+
+    A list holds candidates up to R + skin; whoever sums tests |r_ij| < R (a kernel that is zero
+    from R on does so by itself).
+    """
+
+    grid: Grid
+    support_radius: float
+    """R [m]."""
+    skin: float
+    """How much farther than R the lists reach [m]."""
+    blood_capacity: int
+    wall_capacity: int
+    blood_count: ti.Field
+    blood_index: ti.Field
+    wall_count: ti.Field
+    wall_index: ti.Field
+    cell_start: ti.Field
+    """First row of each cell, shape (cells + 1,)."""
+    wall_cell_start: ti.Field
+    order: ti.Field
+    built_position: ti.MatrixField
+    """Where each particle was when the lists were built [m]."""
+    row_vector: ti.MatrixField
+    row_identity: ti.Field
+    builds: int = 0
+    """How often the lists were built."""
+
+    @classmethod
+    def allocate(
+        cls, grid: Grid, support_radius: float, skin: float, capacity: int,
+        spacing: float, wall_spacing: float,
+    ) -> "Neighbors":  # fmt: skip
+        """Make the fields for `capacity` particles of a spacing and a wall spacing [m]."""
+        reach = support_radius + skin
+        blood = list_capacity(4.0 / 3.0 * math.pi * (reach / spacing) ** 3)
+        # In a narrow tube or a corner twice a plane wall's proxies lie within reach.
+        wall = list_capacity(2.0 * math.pi * (reach / wall_spacing) ** 2)
+        return cls(
+            grid=grid,
+            support_radius=support_radius,
+            skin=skin,
+            blood_capacity=blood,
+            wall_capacity=wall,
+            blood_count=ti.field(int, capacity),
+            blood_index=ti.field(int, (capacity, blood)),
+            wall_count=ti.field(int, capacity),
+            wall_index=ti.field(int, (capacity, wall)),
+            cell_start=ti.field(int, grid.cells + 1),
+            wall_cell_start=ti.field(int, grid.cells + 1),
+            order=ti.field(int, capacity),
+            built_position=ti.Vector.field(3, float, capacity),
+            row_vector=ti.Vector.field(3, float, capacity),
+            row_identity=ti.field(int, capacity),
+        )
+
+    def sort_wall(self, wall: Wall) -> None:
+        """Put the proxies in the order of the grid; again only when the wall changes."""
+        self.wall_cell_start.fill(0)
+        if wall.count == 0:
+            return
+        x = wall.position.to_numpy()
+        c = np.floor((x - np.asarray(self.grid.lower)) / np.asarray(self.grid.cell)).astype(int)
+        c = np.clip(c, 0, np.asarray(self.grid.shape) - 1)
+        cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]
+        order = np.argsort(cell, kind="stable")
+        for field in (wall.position, wall.normal, wall.volume):
+            field.from_numpy(np.ascontiguousarray(field.to_numpy()[order]))
+        start = np.searchsorted(cell[order], np.arange(self.grid.cells + 1))
+        self.wall_cell_start.from_numpy(start.astype(np.int32))
+
+    def build(self, particles: Particles, wall: Wall) -> None:
+        """Drop removed particles (identity < 0), sort the rest and build the lists anew.
+
+        Raises:
+            RunError: a particle has more neighbours than a list holds.
+        """
+        count_cells(particles, self)
+        scan(self.cell_start)
+        fill_cells(particles, self)
+        particles.count[None] = self.cell_start[self.grid.cells]
+        sort_cells(particles, self)
+        reorder_vectors(particles.position, particles, self)
+        reorder_vectors(particles.velocity, particles, self)
+        reorder_vectors(particles.acceleration, particles, self)
+        reorder_identities(particles, self)
+        longest = build_lists(particles, wall, self)
+        self.builds += 1
+        for kind, found, capacity in (
+            ("blood", int(longest[0]), self.blood_capacity),
+            ("wall", int(longest[1]), self.wall_capacity),
+        ):
+            if found >= capacity:  # the last slot is written by candidates that are not near
+                raise RunError(
+                    f"a blood particle has {found} {kind} neighbours within "
+                    f"{self.support_radius + self.skin:.3g} m, the list holds {capacity}: "
+                    "particles have clumped, so the step was too long or the spacing too small"
+                )
+
+
+@ti.kernel
+def count_cells(p: ti.template(), nb: ti.template()):
+    """Histogram over cells, shifted by one; removed particles left out.  Writes: nb.cell_start."""
+    for c in nb.cell_start:
+        nb.cell_start[c] = 0
+    for i in range(p.count[None]):
+        nb.blood_count[i] = 0
+        if p.identity[i] >= 0:
+            ti.atomic_add(nb.cell_start[nb.grid.index(nb.grid.cell_of(p.position[i])) + 1], 1)
+
+
+@ti.kernel
+def scan_serial(a: ti.template()):
+    """Running sum in place."""
+    ti.loop_config(serialize=True)
+    total = 0
+    for k in range(a.shape[0]):
+        total += a[k]
+        a[k] = total
+
+
+_scans: dict[int, ti.algorithms.PrefixSumExecutor] = {}
+
+
+def scan(a: ti.Field) -> None:
+    """Running sum in place: serial on the CPU, whose Taichi has no parallel one."""
+    if ti.cfg.arch in (ti.cuda, ti.vulkan):
+        n = a.shape[0]
+        if n not in _scans:
+            _scans[n] = ti.algorithms.PrefixSumExecutor(n)
+        _scans[n].run(a)
+    else:
+        scan_serial(a)
+
+
+@ti.kernel
+def fill_cells(p: ti.template(), nb: ti.template()):
+    """Rows by cell, in any order inside a cell.  Writes: nb.order; counts in nb.blood_count."""
+    for i in range(p.count[None]):
+        if p.identity[i] >= 0:
+            first = nb.cell_start[nb.grid.index(nb.grid.cell_of(p.position[i]))]
+            # A particle's slot is taken on the counter of the cell's first row.
+            nb.order[first + ti.atomic_add(nb.blood_count[first], 1)] = i
+
+
+@ti.kernel
+def sort_cells(p: ti.template(), nb: ti.template()):
+    """Rows of each cell by identity (insertion sort).  Reads and writes: nb.order."""
+    for c in range(nb.grid.cells):
+        first = nb.cell_start[c]
+        last = nb.cell_start[c + 1]
+        for k in range(first + 1, last):
+            row = nb.order[k]
+            name = p.identity[row]
+            m = k - 1
+            while m >= first and p.identity[nb.order[m]] > name:
+                nb.order[m + 1] = nb.order[m]
+                m -= 1
+            nb.order[m + 1] = row
+
+
+@ti.kernel
+def reorder_vectors(a: ti.template(), p: ti.template(), nb: ti.template()):
+    """Move the rows of a vector field into the order of the grid."""
+    for i in range(p.count[None]):
+        nb.row_vector[i] = a[nb.order[i]]
+    for i in range(p.count[None]):
+        a[i] = nb.row_vector[i]
+
+
+@ti.kernel
+def reorder_identities(p: ti.template(), nb: ti.template()):
+    """Move the identities into the order of the grid."""
+    for i in range(p.count[None]):
+        nb.row_identity[i] = p.identity[nb.order[i]]
+    for i in range(p.count[None]):
+        p.identity[i] = nb.row_identity[i]
+
+
+@ti.kernel
+def build_lists(p: ti.template(), w: ti.template(), nb: ti.template()) -> ti.math.ivec2:
+    """Lists of blood and proxies within R + skin; returns the longest of each.
+
+    Entries beyond a list's capacity are counted, not stored: the caller refuses them.
+    """
+    longest_blood = 0
+    longest_wall = 0
+    for i in range(p.count[None]):
+        x_i = p.position[i]
+        nb.built_position[i] = x_i
+        c = nb.grid.cell_of(x_i)
+        reach2 = ti.static((nb.support_radius + nb.skin) ** 2)
+        blood = 0
+        walls = 0
+        if ti.static(nb.grid.periodic):
+            for dx, dy, dz in ti.ndrange(
+                (-nb.grid.reach, nb.grid.reach + 1),
+                (-nb.grid.reach, nb.grid.reach + 1),
+                (-nb.grid.reach, nb.grid.reach + 1),
+            ):
+                d = c + ti.Vector([dx, dy, dz])
+                inside = 1
+                for a in ti.static(range(3)):
+                    if ti.static(nb.grid.period[a] > 0.0):
+                        d[a] = (d[a] + nb.grid.shape[a]) % nb.grid.shape[a]
+                    elif d[a] < 0 or d[a] >= nb.grid.shape[a]:
+                        inside = 0
+                if inside == 1:
+                    cell = nb.grid.index(d)
+                    for j in range(nb.cell_start[cell], nb.cell_start[cell + 1]):
+                        if nb.grid.separation(x_i, p.position[j]).norm_sqr() < reach2 and j != i:
+                            if blood < nb.blood_capacity:
+                                nb.blood_index[i, blood] = j
+                            blood += 1
+                    for k in range(nb.wall_cell_start[cell], nb.wall_cell_start[cell + 1]):
+                        if nb.grid.separation(x_i, w.position[k]).norm_sqr() < reach2:
+                            if walls < nb.wall_capacity:
+                                nb.wall_index[i, walls] = k
+                            walls += 1
+        else:
+            # Cells that follow along z are one run of rows.  Every candidate is written to the
+            # next slot and the slot taken only if it is near: no branch for the CPU to guess.
+            z0 = ti.max(c[2] - nb.grid.reach, 0)
+            z1 = ti.min(c[2] + nb.grid.reach, nb.grid.shape[2] - 1) + 1
+            for cx in range(
+                ti.max(c[0] - nb.grid.reach, 0),
+                ti.min(c[0] + nb.grid.reach, nb.grid.shape[0] - 1) + 1,
+            ):
+                for cy in range(
+                    ti.max(c[1] - nb.grid.reach, 0),
+                    ti.min(c[1] + nb.grid.reach, nb.grid.shape[1] - 1) + 1,
+                ):
+                    row = (cx * nb.grid.shape[1] + cy) * nb.grid.shape[2]
+                    for j in range(nb.cell_start[row + z0], nb.cell_start[row + z1]):
+                        near = (x_i - p.position[j]).norm_sqr() < reach2
+                        nb.blood_index[i, ti.min(blood, ti.static(nb.blood_capacity - 1))] = j
+                        blood += ti.cast(near, int) & ti.cast(j != i, int)
+                    for k in range(nb.wall_cell_start[row + z0], nb.wall_cell_start[row + z1]):
+                        near = (x_i - w.position[k]).norm_sqr() < reach2
+                        nb.wall_index[i, ti.min(walls, ti.static(nb.wall_capacity - 1))] = k
+                        walls += ti.cast(near, int)
+        nb.blood_count[i] = ti.min(blood, nb.blood_capacity)
+        nb.wall_count[i] = ti.min(walls, nb.wall_capacity)
+        ti.atomic_max(longest_blood, blood)
+        ti.atomic_max(longest_wall, walls)
+    return ti.Vector([longest_blood, longest_wall])

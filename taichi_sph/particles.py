@@ -1,0 +1,77 @@
+"""Particles: the blood's state in Taichi fields."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from taichi_sph.errors import RunError
+
+
+@dataclass(eq=False)
+class Particles:
+    """Blood particles; rows 0..count-1 are live, in the order of the neighbour grid.
+
+    Rows move whenever the grid is rebuilt: `identity` says which particle a row holds.
+    """
+
+    capacity: int
+    """Rows allocated."""
+    mass: float
+    """Mass m of every particle [kg]."""
+    count: ti.Field
+    """Number of live particles, 0-D."""
+    position: ti.MatrixField
+    """x [m], shape (capacity,)."""
+    velocity: ti.MatrixField
+    """v [m/s], shape (capacity,)."""
+    acceleration: ti.MatrixField
+    """a [m/s^2], shape (capacity,); state, for a model may read the previous step's."""
+    density: ti.Field
+    """rho [kg/m^3], shape (capacity,)."""
+    identity: ti.Field
+    """Number of the particle, the same for its whole life, shape (capacity,)."""
+
+    @classmethod
+    def allocate(cls, capacity: int, mass: float) -> "Particles":
+        """Make the fields; once a run, since Taichi frees none."""
+        return cls(
+            capacity=capacity,
+            mass=mass,
+            count=ti.field(int, ()),
+            position=ti.Vector.field(3, float, capacity),
+            velocity=ti.Vector.field(3, float, capacity),
+            acceleration=ti.Vector.field(3, float, capacity),
+            density=ti.field(float, capacity),
+            identity=ti.field(int, capacity),
+        )
+
+    @classmethod
+    def from_numpy(
+        cls, position: np.ndarray, velocity: np.ndarray | None = None, mass: float = 1.0
+    ) -> "Particles":
+        """Particles at given positions [m] and velocities [m/s] (at rest), shape (n, 3).
+
+        Raises:
+            RunError: a position or velocity is not finite.
+        """
+        n = len(position)
+        velocity = np.zeros((n, 3)) if velocity is None else velocity
+        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+            raise RunError("initial positions and velocities must be finite numbers")
+        particles = cls.allocate(n, mass)
+        particles.position.from_numpy(np.asarray(position))
+        particles.velocity.from_numpy(np.asarray(velocity))
+        particles.identity.from_numpy(np.arange(n, dtype=np.int32))
+        particles.count[None] = n
+        return particles
+
+    def in_order(self, field: ti.Field) -> np.ndarray:
+        """Copy of a field's live rows, sorted by identity."""
+        n = self.count[None]
+        order = np.argsort(self.identity.to_numpy()[:n])
+        return field.to_numpy()[:n][order]
+
+    def identities(self) -> np.ndarray:
+        """Live identities, ascending, shape (n,)."""
+        return np.sort(self.identity.to_numpy()[: self.count[None]])

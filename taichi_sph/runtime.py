@@ -1,0 +1,50 @@
+"""Start Taichi: the only call of `ti.init` in the repository."""
+
+import taichi as ti
+
+from taichi_sph.errors import InputError
+
+ARCHITECTURES = ("cpu", "gpu")
+PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+
+
+def start(
+    arch: str = "cpu",
+    precision: str = "f32",
+    threads: int | None = None,
+    debug: bool = False,
+    random_seed: int = 0,
+) -> None:
+    """Start Taichi once per process; fields made before are lost.
+
+    Args:
+        arch: "cpu", or "gpu" for the first of CUDA, Vulkan, Metal that works.
+        precision: "f32" or "f64", the type of every `float` in a kernel.
+        threads: CPU threads; all by default.
+        debug: check bounds of every field access (slow).
+        random_seed: seed of Taichi's own generator.
+
+    Raises:
+        InputError: an unknown architecture or precision, or no GPU.
+    """
+    if arch not in ARCHITECTURES:
+        raise InputError(f"--arch {arch}: allowed are {', '.join(ARCHITECTURES)}")
+    if precision not in PRECISIONS:
+        raise InputError(f"--precision {precision}: allowed are {', '.join(PRECISIONS)}")
+    options = {"cpu_max_num_threads": threads} if threads else {}
+    ti.init(
+        arch=ti.gpu if arch == "gpu" else ti.cpu,
+        default_fp=PRECISIONS[precision],
+        default_ip=ti.i32,
+        # Halves the cost of the sums (square roots, quotients).  It lets the compiler assume that
+        # nothing is NaN, so `integrator.is_finite` looks at the bits.
+        fast_math=True,
+        debug=debug,
+        short_circuit_operators=True,
+        random_seed=random_seed,
+        log_level=ti.ERROR,
+        offline_cache=True,
+        **options,
+    )
+    if arch == "gpu" and ti.cfg.arch in (ti.x64, ti.arm64):
+        raise InputError("--arch gpu: no CUDA, Vulkan or Metal device was found; use --arch cpu")

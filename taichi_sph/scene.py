@@ -1,0 +1,186 @@
+"""Scene: what the user wrote, checked.  TOML -> frozen structures, SI units.
+
+Nothing here imports taichi; derived numbers are worked out elsewhere and printed, never typed.
+"""
+
+import math
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import msgspec
+
+from taichi_sph.errors import InputError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Vector = tuple[float, float, float]
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A TOML table in which an unknown key is an error."""
+
+
+class VesselTable(_Table):
+    """The lumen surface."""
+
+    surface: str
+    """Surface file (STL, PLY, OBJ), relative to the scene file."""
+    scale: Positive = 1.0
+    """Metres per unit of the surface file [m]."""
+
+
+class OpeningTable(_Table):
+    """One opening of the vessel; geometry is read off the surface, this says which one."""
+
+    centre: Vector
+    """A point near the middle of the opening [units of the surface file]."""
+    state: Literal["open", "capped"] = "open"
+    """Blood leaves through an open one and is counted; a capped one is wall."""
+
+
+class Column(_Table):
+    """The blood at the start: a column in the lumen, at rest.  Give height or particles."""
+
+    opening: str
+    """The opening that the column stands at."""
+    height: Positive | None = None
+    """Depth of the column, from its top inward along the opening's normal [m]."""
+    particles: Annotated[int, msgspec.Meta(gt=0)] | None = None
+    """Number of blood particles; the height follows from it."""
+    offset: NonNegative = 0.0
+    """Distance from the opening's plane to the top of the column [m]."""
+
+    def __post_init__(self) -> None:
+        if (self.height is None) == (self.particles is None):
+            raise ValueError("give height [m] or particles, one of the two")
+
+
+class NewtonianTable(_Table, tag_field="model", tag="newtonian"):
+    """Constant viscosity."""
+
+    viscosity: Positive = 3.5e-3
+    """Dynamic viscosity mu [Pa s]; 3.5 mPa s is blood's nominal one (Fluids 2017, 2, 10)."""
+
+
+class CassonTable(_Table, tag_field="model", tag="casson"):
+    """Casson's law, Eq. 8, with Papanastasiou's regulariser."""
+
+    viscosity: Positive = 3.5e-3
+    """Casson viscosity eta [Pa s] (Fung, Biomechanics, haematocrit 45 %)."""
+    yield_stress: NonNegative = 5e-3
+    """Yield stress tau_y [Pa] (Merrill: 2-10 mPa)."""
+    regularisation: Positive = 7.0
+    """Time n of the regulariser [s]; the paper's value."""
+    printed: bool = False
+    """Use the regulariser as the paper prints it, exp(-n g): thin at rest, for study only."""
+
+
+class Blood(_Table):
+    """The liquid."""
+
+    density: Positive = 1060.0
+    """Rest density rho_0 [kg/m^3] (svMultiPhysics test cases; 1050-1060)."""
+    rheology: Union[NewtonianTable, CassonTable] = CassonTable()
+    """Viscosity law."""
+    artificial_viscosity: NonNegative = 0.05
+    """Monaghan's alpha [-]: damps sound between approaching particles."""
+
+
+class Discretization(_Table):
+    """How finely the scene is resolved."""
+
+    spacing: Positive
+    """Distance d between blood particles at rest [m]."""
+    support_ratio: Annotated[float, msgspec.Meta(ge=1.5, le=4.0)] = 2.0
+    """Support radius R over spacing [-]."""
+    wall_spacing_ratio: Annotated[float, msgspec.Meta(ge=0.25, le=1.0)] = 1.0
+    """Spacing of the wall's proxy particles over that of blood [-]."""
+    sound_speed_ratio: Annotated[float, msgspec.Meta(ge=2.0, le=100.0)] = 10.0
+    """Sound speed over the largest speed that the drop allows [-]; 10 keeps density to 1 %."""
+    integrator: Literal["symplectic", "paper"] = "symplectic"
+    """Semi-implicit Euler, or Eqs. 17 and 18 as printed (unstable: for study only)."""
+    viscous_form: Literal["pairwise", "nested"] = "pairwise"
+    """Morris' pairwise form, or the paper's nested form of Eqs. 10 and 12."""
+
+
+class Scene(_Table):
+    """A vessel, the blood in it, and how long to watch."""
+
+    title: str
+    vessel: VesselTable
+    column: Column
+    discretization: Discretization
+    duration: Positive
+    """Simulated time of a run [s]."""
+    frame_interval: Positive
+    """Simulated time between two frames [s]."""
+    gravity: Vector
+    """Body force per mass g [m/s^2]."""
+    openings: dict[str, OpeningTable] = {}
+    """Openings by name; one that the surface has and the scene does not name is capped."""
+    blood: Blood = Blood()
+    folder: str = "."
+    """Where relative paths start: the scene file's folder (set by the reader)."""
+    name: str = "scene"
+    """Short name (set by the reader)."""
+    text: str = ""
+    """The TOML text as read, kept in recordings (set by the reader)."""
+
+    def __post_init__(self) -> None:
+        for name in ("duration", "frame_interval"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite")
+        if not all(math.isfinite(g) for g in self.gravity) or math.hypot(*self.gravity) > 1e3:
+            raise ValueError(f"gravity: {self.gravity} m/s^2 is not a plausible body force")
+        if self.openings and self.column.opening not in self.openings:
+            allowed = ", ".join(self.openings)
+            raise ValueError(
+                f"column.opening: {self.column.opening!r} is not an opening; allowed: {allowed}"
+            )
+
+
+def _plain(error: Exception) -> str:
+    """Msgspec's message without its JSON-path decoration."""
+    text = str(error).replace("`", "")
+    return text.replace(" - at $.", " at ").replace("Object contains u", "u")
+
+
+def parse_scene(text: str, source: str, folder: Path, name: str) -> Scene:
+    """Build a scene from TOML text.
+
+    Raises:
+        InputError: the text is no TOML, a key is unknown or missing, a value is out of range.
+    """
+    try:
+        table: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: not a TOML file: {error}") from None
+    for key in ("folder", "name", "text"):
+        if key in table:
+            raise InputError(f"{source}: unknown key {key!r}")
+    table |= {"folder": str(folder), "name": name, "text": text}
+    try:
+        return msgspec.convert(table, Scene)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{source}: {_plain(error)}") from None
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a scene file.
+
+    Raises:
+        InputError: as `parse_scene`, or the file cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise InputError(f"{path}: cannot read the scene: {reason}") from None
+    name = path.parent.name if path.stem == "scene" else path.stem
+    return parse_scene(text, str(path), path.parent.resolve(), name)

@@ -1,0 +1,179 @@
+"""Simulation: the blood of a scene in its vessel."""
+
+from collections.abc import Callable
+
+import numpy as np
+import taichi as ti
+
+from taichi_sph.acceleration import AccelerationModel, Fluid, SphAcceleration
+from taichi_sph.calibration import calibrate
+from taichi_sph.derived import Derived, derive
+from taichi_sph.diagnostics import Diagnostics, compression
+from taichi_sph.equation_of_state import Tait
+from taichi_sph.motion import Motion
+from taichi_sph.neighbors import Neighbors, make_grid
+from taichi_sph.particles import Particles
+from taichi_sph.rheology import rheology_of
+from taichi_sph.scene import Scene
+from taichi_sph.smoothing_kernels import WendlandC2
+from taichi_sph.vessel import Vessel, read_vessel
+from taichi_sph.wall import Wall
+
+ModelMaker = Callable[[Fluid, int], AccelerationModel]
+"""Makes a model for a fluid and a number of particles."""
+
+SKIN = 0.2
+"""Skin of the neighbour lists over the support radius; the fastest of 0.1-0.4 on scene A."""
+
+OPENING_REACH = 2.5
+"""Blood beyond an opening's plane has left by it within this many radii of its centre."""
+
+LOST = -2
+"""identity of a particle that left the grid's box; drained ones have -3 - opening."""
+
+
+@ti.kernel
+def mark_removed(
+    p: ti.template(),
+    grid: ti.template(),
+    centre: ti.template(),
+    normal: ti.template(),
+    reach: ti.template(),
+    removed: ti.template(),
+):
+    """Mark blood beyond an open opening, or out of the box.  Writes: identity, removed."""
+    for i in range(p.count[None]):
+        x = p.position[i]
+        for k in range(centre.shape[0]):
+            r = x - centre[k]
+            if reach[k] > 0.0 and r.dot(normal[k]) > 0.0 and r.norm() < reach[k]:
+                if p.identity[i] >= 0:
+                    p.identity[i] = LOST - 1 - k
+                    ti.atomic_add(removed[k], 1)
+        if p.identity[i] >= 0:
+            for a in ti.static(range(3)):
+                upper = grid.lower[a] + grid.cell[a] * grid.shape[a]
+                outside = x[a] < grid.lower[a] or x[a] > upper
+                if outside and p.identity[i] >= 0:
+                    p.identity[i] = LOST
+                    ti.atomic_add(removed[centre.shape[0]], 1)
+
+
+class Simulation(Motion):
+    """Blood of a scene in its vessel."""
+
+    def __init__(
+        self, scene: Scene, vessel: Vessel, make_model: ModelMaker = SphAcceleration, seed: int = 0
+    ):
+        """Sample the wall, fill the column and set up the model (the physics by default).
+
+        Raises:
+            InputError: the column does not fit the vessel.
+        """
+        grid = scene.discretization
+        kernel = WendlandC2(grid.support_ratio * grid.spacing)
+        wall_spacing = grid.wall_spacing_ratio * grid.spacing
+        calibration = calibrate(kernel, grid.spacing, wall_spacing, scene.blood.density)
+        setback = calibration.setback
+        sample = vessel.sample_wall(wall_spacing, setback, seed)
+        blood = vessel.fill_column(scene.column, grid.spacing)
+        self.scene = scene
+        self.vessel = vessel
+        self.derived: Derived = derive(scene, vessel, len(blood), len(sample.positions))
+        fluid = Fluid(
+            kernel=kernel,
+            state=Tait(scene.blood.density, self.derived.sound_speed),
+            rheology=rheology_of(scene.blood.rheology),
+            calibration=calibration,
+            artificial_viscosity=scene.blood.artificial_viscosity,
+            nested=grid.viscous_form == "nested",
+        )
+        particles = Particles.from_numpy(blood, mass=fluid.calibration.mass)
+        wall = Wall.from_numpy(sample.positions, sample.normals, kernel, setback, wall_spacing)
+        skin = SKIN * kernel.support_radius
+        margin = 2.0 * (kernel.support_radius + skin)
+        lower, upper = vessel.vertices.min(axis=0) - margin, vessel.vertices.max(axis=0) + margin
+        neighbors = Neighbors.allocate(
+            make_grid(lower, upper, kernel.support_radius + skin),
+            kernel.support_radius,
+            skin,
+            len(blood),
+            grid.spacing,
+            wall_spacing,
+        )
+        super().__init__(
+            particles,
+            wall,
+            neighbors,
+            make_model(fluid, len(blood)),
+            scene.gravity,
+            # Faster than sound the equation of state means nothing.
+            speed_limit=self.derived.sound_speed,
+            integrator=grid.integrator,
+        )
+        openings = vessel.openings
+        self._opening_centre = ti.Vector.field(3, float, max(1, len(openings)))
+        self._opening_normal = ti.Vector.field(3, float, max(1, len(openings)))
+        self._opening_reach = ti.field(float, max(1, len(openings)))
+        self._removed = ti.field(int, max(1, len(openings)) + 1)
+        for k, opening in enumerate(openings):
+            self._opening_centre[k] = opening.centre
+            self._opening_normal[k] = opening.normal
+            self._opening_reach[k] = OPENING_REACH * opening.radius if opening.is_open else 0.0
+
+    @classmethod
+    def from_scene(
+        cls, scene: Scene, make_model: ModelMaker = SphAcceleration, seed: int = 0
+    ) -> "Simulation":
+        """Read the vessel of a scene and set everything up.
+
+        Raises:
+            InputError: the surface cannot be used, or the column does not fit.
+        """
+        return cls(scene, read_vessel(scene), make_model, seed)
+
+    def before_build(self) -> None:
+        """Mark what has left through an opening, or out of the box."""
+        mark_removed(
+            self.particles,
+            self.neighbors.grid,
+            self._opening_centre,
+            self._opening_normal,
+            self._opening_reach,
+            self._removed,
+        )
+
+    def positions(self) -> np.ndarray:
+        """Positions of the live blood [m], shape (n, 3), in order of identity."""
+        return self.particles.in_order(self.particles.position)
+
+    def velocities(self) -> np.ndarray:
+        """Velocities of the live blood [m/s], shape (n, 3), in order of identity."""
+        return self.particles.in_order(self.particles.velocity)
+
+    def identities(self) -> np.ndarray:
+        """Identities of the live blood, ascending, shape (n,)."""
+        return self.particles.identities()
+
+    def diagnostics(self) -> Diagnostics:
+        """Figures of the present state; leaks are counted against the surface itself."""
+        removed = self._removed.to_numpy()
+        names = [o.name for o in self.vessel.openings]
+        drained = {name: int(n) for name, n in zip(names, removed, strict=False)}
+        velocity = self.velocities().astype(np.float64)
+        density = self.particles.in_order(self.particles.density)
+        p99, largest = compression(density, self.scene.blood.density) if self.steps else (0.0, 0.0)
+        speed2 = (velocity**2).sum(axis=1)
+        return Diagnostics(
+            time=self.time,
+            step=self.last_step,
+            particles=len(velocity),
+            drained=drained,
+            drained_volume=sum(drained.values()) * self.particles.mass / self.scene.blood.density,
+            leaks=self.vessel.count_leaks(self.positions()) + int(removed[-1]),
+            wall_corrections=self.wall_corrections,
+            compression_p99=p99,
+            compression_max=largest,
+            kinetic_energy=float(0.5 * self.particles.mass * speed2.sum()),
+            max_speed=float(np.sqrt(speed2.max(initial=0.0))),
+        )
