@@ -61,7 +61,6 @@ def proxy_volumes(
 ) -> np.ndarray:
     """V_k = 1 / sum_l W(x_k - x_l) over proxies, itself included (Eq. 3), [m^3], shape (m,)."""
     position = np.asarray(position, dtype=np.float64)
-    m = len(position)
     points = position
     if period is not None:
         copies = [position]
@@ -70,13 +69,9 @@ def proxy_volumes(
             shift[axis] = period[axis]
             copies = [p + s for p in copies for s in (0.0 * shift, shift, -shift)]
         points = np.concatenate(copies)
-    tree = cKDTree(points)
-    total = np.zeros(m)
-    for first in range(0, m, 20000):  # bounded memory for large walls
-        rows = tree.query_ball_point(position[first : first + 20000], kernel.support_radius)
-        lengths = np.array([len(r) for r in rows])
-        j = np.concatenate([np.asarray(r, dtype=np.int64) for r in rows])
-        i = first + np.repeat(np.arange(len(rows)), lengths)
-        w = kernel.w_of(np.linalg.norm(position[i] - points[j], axis=1))
-        total += np.bincount(i, weights=w, minlength=m)
-    return 1.0 / total
+    pairs = cKDTree(points).query_pairs(kernel.support_radius, output_type="ndarray")
+    w = kernel.w_of(np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1))
+    total = np.full(len(points), kernel.peak)
+    total += np.bincount(pairs[:, 0], weights=w, minlength=len(points))
+    total += np.bincount(pairs[:, 1], weights=w, minlength=len(points))
+    return 1.0 / total[: len(position)]

@@ -1,0 +1,46 @@
+# make run       install into .venv and pour blood into the aorta and its iliac arteries
+# make test      install, lint, type-check, run the tests
+# make validate  compare the physics with theory (minutes)
+
+PYTHON ?= python3
+SCENE ?= aortoiliac
+OPTIONS ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+INSTALLED := .venv/.installed
+DEVELOPS := .venv/.installed-dev
+
+.PHONY: run test validate lint clean
+.DEFAULT_GOAL := run
+
+run: $(INSTALLED)
+	@mkdir -p recordings
+	$(BIN)/vesselflow run $(SCENE) --rrd recordings/$(notdir $(basename $(SCENE))).rrd $(OPTIONS)
+
+test: lint
+	$(BIN)/pytest
+
+lint: $(DEVELOPS)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+validate: $(INSTALLED)
+	$(BIN)/vesselflow validate $(OPTIONS)
+
+$(BIN)/python:
+	$(PYTHON) -m venv .venv
+
+# Installed again only when what is asked for has changed.
+$(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(DEVELOPS): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable '.[dev]'
+	@touch $@ $(INSTALLED)
+
+clean:
+	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache build dist recordings
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,108 @@
+"""How a picture of the blood looks: colours of speed and where the eye stands."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SPEED_COLOURS = (
+    (0x6B, 0x0F, 0x1A),
+    (0x8F, 0x12, 0x1B),
+    (0xB5, 0x16, 0x19),
+    (0xD6, 0x2B, 0x16),
+    (0xEE, 0x55, 0x1B),
+    (0xFA, 0x80, 0x2E),
+    (0xFF, 0xAA, 0x4D),
+    (0xFF, 0xD0, 0x7A),
+    (0xFF, 0xF2, 0xC2),
+)
+"""Dark red at rest to pale yellow, (red, green, blue) at even steps; a test holds that the CIE
+lightness rises evenly, so that equal differences of speed look equal."""
+
+WALL_COLOUR = (0xE0, 0x98, 0x90, 0x2A)
+"""Red, green, blue, opacity."""
+BACKGROUND = (14, 16, 20)
+FIELD_OF_VIEW = math.radians(55.0)
+"""Rerun's vertical field of view."""
+ASPECT = 1.1
+"""Width over height that the vessel has to fit in: the 3-D part of an ordinary window."""
+TILT = math.radians(12.0)
+"""The eye looks down a little, which tells near from far."""
+
+
+def colour_table(entries: int = 256) -> NDArray[np.uint32]:
+    """Colours of speed as 0xRRGGBBAA, from rest to full scale, shape (entries,)."""
+    anchors = np.array(SPEED_COLOURS, float)
+    at = np.linspace(0.0, 1.0, entries)
+    even = np.linspace(0.0, 1.0, len(anchors))
+    red, green, blue = (
+        np.rint(np.interp(at, even, anchors[:, k])).astype(np.uint32) for k in range(3)
+    )
+    return (red << 24) | (green << 16) | (blue << 8) | np.uint32(0xFF)
+
+
+_TABLE = colour_table()
+
+
+def speed_colours(
+    velocities: NDArray[np.floating], full_scale: float
+) -> tuple[NDArray[np.uint32], NDArray[np.floating]]:
+    """Colours and speeds [m/s] of velocities (n, 3); `full_scale` [m/s] and above is brightest."""
+    speed = np.sqrt(np.einsum("ij,ij->i", velocities, velocities))
+    last = len(_TABLE) - 1
+    # Not finite, it is shown as the fastest.
+    level = np.nan_to_num(speed * (last / full_scale), nan=last, posinf=last)
+    return _TABLE[np.clip(level, 0, last).astype(np.intp)], speed
+
+
+def upward(gravity: tuple[float, float, float]) -> Floats:
+    """Unit vector against gravity; +z without gravity."""
+    g = np.asarray(gravity, float)
+    size = float(np.linalg.norm(g))
+    return -g / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+
+
+def eye(vertices: Floats, up: Floats) -> tuple[Floats, Floats]:
+    """Position of the eye and the point that it looks at [m], so that all vertices are in view.
+
+    It looks across the vessel's broad side: along the horizontal in which the vessel is thinnest,
+    from slightly above.
+    """
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    around = vertices - middle
+    # Any two horizontals, then the principal directions of the vessel's shadow on them.
+    first = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    shadow = around @ np.column_stack([first, second])
+    _, directions = np.linalg.eigh(np.cov(shadow.T))
+    thin = directions[0, 0] * first + directions[1, 0] * second
+    # The sign of an eigenvector is arbitrary: towards the positive side of its largest part.
+    thin *= math.copysign(1.0, float(thin[np.abs(thin).argmax()]))
+    back = math.cos(TILT) * thin + math.sin(TILT) * up
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    above = np.cross(back, right)
+    x, y, z = around @ right, around @ above, around @ back
+    # Off the bounding box's middle a long thin shape would sit beside the picture's.
+    shift = 0.5 * (x.min() + x.max()) * right + 0.5 * (y.min() + y.max()) * above
+    x, y = x - 0.5 * (x.min() + x.max()), y - 0.5 * (y.min() + y.max())
+    slope = math.tan(0.5 * FIELD_OF_VIEW)
+    distance = max(
+        float((np.abs(y) / slope + z).max()), float((np.abs(x) / (slope * ASPECT) + z).max())
+    )
+    target = middle + shift
+    return target + 1.1 * distance * back, target
+
+
+def vertex_normals(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
+    """Unit normals of vertices, area-weighted means of their triangles', shape (n, 3)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    of_faces = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], of_faces)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.maximum(length, np.finfo(float).tiny)

@@ -1,0 +1,380 @@
+"""`vesselflow bench`: what a step costs, beside a peer in the same run, over size, and at start.
+
+Every row is measured in a process of its own, since Taichi frees no field.  Times are medians over
+frames or blocks of steps, neighbour search included; nothing is logged or drawn meanwhile.
+"""
+
+import ctypes
+import importlib.util
+import json
+import multiprocessing
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taichi_sph.errors import InputError, RunError
+from taichi_sph.scene import Scene, parse_scene, read_scene
+
+BLOCK = 20
+"""Steps between two changes of side when two programs are timed in turn."""
+
+SPEED_OF_PEER_COLUMN = 10.0
+"""Sound speed of the column that both programs hold [m/s]."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured case."""
+
+    case: str
+    blood_particles: int
+    proxy_particles: int
+    step_ms: float
+    """Median cost of a step [ms]."""
+    step_ms_low: float
+    """First quartile."""
+    step_ms_high: float
+    """Third quartile."""
+    microseconds_per_particle_step: float
+    real_time_factor: float
+    """Simulated seconds per wall second."""
+    memory_mib: float
+    """Largest resident memory of the process [MiB]."""
+
+
+def _row(case: str, blood: int, proxies: int, steps: list[float], dt: float) -> Row:
+    low, middle, high = np.percentile(steps, [25, 50, 75])
+    return Row(
+        case=case,
+        blood_particles=blood,
+        proxy_particles=proxies,
+        step_ms=1e3 * middle,
+        step_ms_low=1e3 * low,
+        step_ms_high=1e3 * high,
+        microseconds_per_particle_step=1e6 * middle / blood,
+        real_time_factor=dt / middle,
+        memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    )
+
+
+def _in_own_process(work: Callable[..., Any], *args: Any) -> Any:
+    """Result of a function called in a fresh process."""
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(1) as pool:
+        return pool.apply(work, args)
+
+
+def measure_scene(path: Path, arch: str, threads: int | None, duration: float) -> Row:
+    """Cost of a step over the first `duration` [s] of a scene: median over its frames."""
+    from taichi_sph import Simulation, start
+
+    start(arch, threads=threads)
+    scene = read_scene(path)
+    simulation = Simulation.from_scene(scene)
+    derived = simulation.derived
+    simulation.advance_to(2.0 * derived.step)  # compile
+    costs, before = [], time.perf_counter()
+    while simulation.time < duration and simulation.particles.count[None]:
+        steps = simulation.steps
+        before = time.perf_counter()
+        simulation.advance_to(simulation.time + 0.2 * scene.frame_interval)
+        costs.append((time.perf_counter() - before) / (simulation.steps - steps))
+    return _row(
+        scene.name, derived.blood_particles, derived.proxy_particles, costs, simulation.last_step
+    )
+
+
+def _box_scene(across: int, height: int, fill: int, wall_ratio: float, folder: Path) -> Scene:
+    """A column of `across` x `across` x `fill` particles in a square tank, spacing 1 mm."""
+    import trimesh
+
+    d = 1e-3
+    size = np.array([across, across, height]) * d
+    trimesh.creation.box(extents=size).export(folder / "box.stl")
+    text = f"""
+title = "square tank"
+duration = 1.0
+frame_interval = 0.005
+gravity = [0.0, 0.0, -9.81]
+[vessel]
+surface = "box.stl"
+[openings.top]
+centre = [0.0, 0.0, {size[2] / 2}]
+state = "open"
+[column]
+opening = "top"
+offset = {(height - fill) * d}
+particles = {across * across * fill}
+[blood]
+rheology = {{ model = "newtonian" }}
+[discretization]
+spacing = {d}
+wall_spacing_ratio = {wall_ratio}
+"""
+    return parse_scene(text, "bench", folder, f"box {across}x{across}x{fill}")
+
+
+def measure_column(across: int, fill: int, arch: str, threads: int | None) -> Row:
+    """Cost of a step of a settling column in a tank just larger than it."""
+    from taichi_sph import Simulation, start
+
+    start(arch, threads=threads)
+    with tempfile.TemporaryDirectory() as folder:
+        simulation = Simulation.from_scene(_box_scene(across, fill + 10, fill, 1.0, Path(folder)))
+    _blocks(lambda: simulation.step(1.0), 1)
+    costs = [_blocks(lambda: simulation.step(1.0), 1) for _ in range(8)]
+    d = simulation.derived
+    return _row(
+        simulation.scene.name, d.blood_particles, d.proxy_particles, costs, simulation.last_step
+    )
+
+
+def _blocks(step: Callable[[], Any], count: int) -> float:
+    """Mean seconds of a step over `count` blocks."""
+    before = time.perf_counter()
+    for _ in range(count * BLOCK):
+        step()
+    return (time.perf_counter() - before) / (count * BLOCK)
+
+
+def has_peer() -> bool:
+    """Whether pysplishsplash is installed."""
+    return importlib.util.find_spec("pysplishsplash") is not None
+
+
+def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, sound: float) -> Any:
+    """SPlisHSPlasH's WCSPH with a like column in a like tank; returns (step, blood, proxies)."""
+    for library in ("X11.so.6", "GLdispatch.so.0", "GLX.so.0", "OpenGL.so.0", "GL.so.1"):
+        # Its wheel brings a GL that crashes at import unless the system's is there first.
+        try:
+            ctypes.CDLL(f"lib{library}", mode=ctypes.RTLD_GLOBAL)
+        except OSError as error:
+            raise RunError(f"bench --peer: pysplishsplash needs lib{library} ({error})") from None
+    import pysplishsplash as sph
+    import trimesh
+
+    d = 1e-3
+    # Its first layer stands one spacing off the wall, ours half of one.
+    size = np.array([across + 1, across + 1, height]) * d
+    mesh = trimesh.creation.box(extents=size)
+    mesh.apply_translation([0.0, 0.0, size[2] / 2])
+    mesh.export(folder / "tank.obj")
+    half = 0.5 * (across + 1) * d
+    scene = {
+        "Configuration": {
+            "particleRadius": d / 2,
+            "numberOfStepsPerRenderUpdate": 1,
+            "simulationMethod": 0,
+            "gravitation": [0, 0, -9.81],
+            "cflMethod": 0,
+            "timeStepSize": dt,
+            "stiffness": 1060.0 * sound**2 / 7.0,
+            "exponent": 7,
+            "boundaryHandlingMethod": 0,
+            "enableZSort": True,
+        },
+        "Materials": [{"id": "Fluid", "density0": 1060.0, "viscosityMethod": 1}],
+        "FluidBlocks": [
+            {
+                "id": "Fluid",
+                "denseMode": 0,
+                "start": [-half, -half, 0.0],
+                "end": [half, half, (fill + 1) * d],
+                "translation": [0, 0, 0],
+                "scale": [1, 1, 1],
+            }
+        ],
+        "RigidBodies": [
+            {
+                "id": 1,
+                "geometryFile": str(folder / "tank.obj"),
+                "translation": [0, 0, 0],
+                "rotationAxis": [1, 0, 0],
+                "rotationAngle": 0,
+                "scale": [1, 1, 1],
+                "isDynamic": False,
+                "isWall": True,
+                "mapInvert": True,
+                "samplingMode": 0,
+            }
+        ],
+    }
+    (folder / "peer.json").write_text(json.dumps(scene))
+    base = sph.Exec.SimulatorBase()
+    base.init(useGui=False, sceneFile=str(folder / "peer.json"), outputDir=str(folder / "out"))
+    base.setValueFloat(base.STOP_AT, 1e-9)
+    base.initSimulation()
+    base.runSimulation()  # loads the wall
+    simulation = sph.Simulation.getCurrent()
+    fluid = simulation.getFluidModel(0)
+    viscosity = fluid.getViscosityBase()
+    for key in (viscosity.VISCOSITY_COEFFICIENT, viscosity.VISCOSITY_COEFFICIENT_BOUNDARY):
+        viscosity.setValueFloat(key, 3.5e-3 / 1060.0)
+    keep = (base, simulation)  # alive as long as the step is
+    return (
+        lambda: keep[1].getTimeStep().step(),
+        fluid.numActiveParticles(),
+        simulation.getBoundaryModel(0).numberOfParticles(),
+    )
+
+
+def measure_peer(threads: int | None) -> list[Row]:
+    """A column of 16 000 in a tank of some 58 000 proxies: ours and the peer's, in turn."""
+    from taichi_sph import Simulation, start
+
+    start("cpu", threads=threads)
+    if threads:
+        os.environ["OMP_NUM_THREADS"] = str(threads)
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        # 0.64 gives the peer's own density of wall particles.
+        simulation = Simulation.from_scene(_box_scene(20, 270, 40, 0.64, folder))
+        simulation.step(1.0)
+        sound = simulation.derived.sound_speed
+        peer, blood, proxies = _start_peer(folder, 20, 270, 40, simulation.last_step, sound)
+        ours: list[float] = []
+        theirs: list[float] = []
+        for _ in range(2 + 12):
+            ours.append(_blocks(lambda: simulation.step(1.0), 1))
+            theirs.append(_blocks(peer, 1))
+        d = simulation.derived
+        dt = simulation.last_step
+        rows.append(_row("column, vesselflow", d.blood_particles, d.proxy_particles, ours[2:], dt))
+        rows.append(_row("column, SPlisHSPlasH WCSPH", blood, proxies, theirs[2:], dt))
+    return rows
+
+
+def measure_start(scene: str, arch: str) -> tuple[float, float]:
+    """Wall seconds of `vesselflow run SCENE --frames 1`, without and with a kernel cache."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = dict(os.environ, TI_OFFLINE_CACHE_FILE_PATH=cache, XDG_CACHE_HOME=cache)
+        times = []
+        for _ in range(2):
+            before = time.perf_counter()
+            subprocess.run(
+                [sys.executable, "-m", "app", "run", scene, "--frames", "1", "--arch", arch],
+                check=True,
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            times.append(time.perf_counter() - before)
+    return times[0], times[1]
+
+
+def _machine(arch: str, threads: int | None) -> dict[str, Any]:
+    """What the figures were measured on."""
+    model = platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [s for s in cpuinfo.read_text().splitlines() if s.startswith("model name")]
+        model = names[0].partition(":")[2].strip() if names else model
+    import taichi
+
+    return {
+        "processor": model,
+        "cores": os.cpu_count(),
+        "threads": threads or os.cpu_count(),
+        "arch": arch,
+        "precision": "f32",
+        "python": platform.python_version(),
+        "taichi": ".".join(map(str, taichi.__version__)),
+    }
+
+
+def main(
+    scenes: list[Path],
+    arch: str = "cpu",
+    threads: int | None = None,
+    peer: bool = False,
+    scale: bool = False,
+    start_up: bool = False,
+    json_file: Path | None = None,
+) -> int:
+    """Measure and print; returns the exit code.
+
+    Raises:
+        InputError: the peer is asked for and not installed.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    if peer and not has_peer():
+        raise InputError("--peer: pysplishsplash is not installed; pip install 'vesselflow[peer]'")
+    console = Console()
+    machine = _machine(arch, threads)
+    console.print(", ".join(f"{key} {value}" for key, value in machine.items()))
+    rows: list[Row] = []
+    for path in scenes:
+        rows.append(_in_own_process(measure_scene, path, arch, threads, 0.1))
+    notes = []
+    if peer:
+        ours, theirs = _in_own_process(measure_peer, threads)
+        rows += [ours, theirs]
+        ratio = ours.microseconds_per_particle_step / theirs.microseconds_per_particle_step
+        notes.append(f"a particle-step costs {ratio:.2f} of the peer's")
+    if scale:
+        sizes = [_in_own_process(measure_column, *s, arch, threads) for s in COLUMNS]
+        rows += sizes
+        costs = [row.microseconds_per_particle_step for row in sizes]
+        notes.append(
+            f"cost a particle-step from {sizes[0].blood_particles} to {sizes[-1].blood_particles} "
+            f"blood particles: {min(costs):.3f} to {max(costs):.3f} us, "
+            f"{max(costs) / min(costs) - 1:.0%} apart"
+        )
+    starts = {}
+    if start_up:
+        for path in scenes:
+            starts[str(path)] = measure_start(str(path), arch)
+            cold, warm = starts[str(path)]
+            notes.append(
+                f"{path.parent.name}/{path.stem} to frame 1: {cold:.1f} s cold, {warm:.1f} s warm"
+            )
+    table = Table(title="cost of a step, neighbour search included")
+    for heading in (
+        "case",
+        "blood",
+        "proxies",
+        "step ms",
+        "quartiles",
+        "us/particle",
+        "real time",
+        "MiB",
+    ):
+        table.add_column(heading, justify="left" if heading == "case" else "right")
+    for row in rows:
+        table.add_row(
+            row.case,
+            str(row.blood_particles),
+            str(row.proxy_particles),
+            f"{row.step_ms:.2f}",
+            f"{row.step_ms_low:.2f}-{row.step_ms_high:.2f}",
+            f"{row.microseconds_per_particle_step:.3f}",
+            f"{row.real_time_factor:.5f}",
+            f"{row.memory_mib:.0f}",
+        )
+    console.print(table)
+    for note in notes:
+        console.print(note)
+    if json_file:
+        result = {"machine": machine, "rows": [asdict(r) for r in rows], "starts": starts}
+        temporary = json_file.with_suffix(".part")
+        temporary.write_text(json.dumps(result, indent=1))
+        temporary.replace(json_file)
+    return 0
+
+
+COLUMNS = ((20, 40), (32, 61), (50, 100))
+"""Columns of --scale: particles across and high; 16 000, 62 464 and 250 000."""

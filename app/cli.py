@@ -1,0 +1,346 @@
+"""The command line: it parses and wires, and turns errors into one sentence and an exit code."""
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from taichi_sph.errors import InputError, RunError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from app.drive import Summary
+    from taichi_sph.scene import Scene
+
+EPILOG = "All quantities are in SI units. Exit codes: 0 done, 1 the run diverged, 2 wrong input."
+LIVE_PORT = 9876
+
+arch_option = click.option(
+    "--arch",
+    type=click.Choice(["cpu", "gpu"]),
+    default="cpu",
+    show_default=True,
+    help="Where to compute; gpu is the first of CUDA, Vulkan and Metal that works.",
+)
+threads_option = click.option(
+    "--threads", type=click.IntRange(min=1), help="CPU threads.  [default: all]"
+)
+precision_option = click.option(
+    "--precision",
+    type=click.Choice(["f32", "f64"]),
+    default="f32",
+    show_default=True,
+    help="Numbers of the simulation.",
+)
+output_path = click.Path(path_type=Path)
+
+
+def version() -> str:
+    """Version of the installed program."""
+    from importlib.metadata import PackageNotFoundError
+    from importlib.metadata import version as installed
+
+    try:
+        return installed("vesselflow")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def print_version(context: click.Context, _: click.Parameter, asked: bool) -> None:
+    """Answer --version."""
+    if asked:
+        click.echo(f"vesselflow {version()}")
+        context.exit()
+
+
+@click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=print_version,
+    help="Print the version and leave.",
+)
+def cli() -> None:
+    """Blood in vessels by smoothed particle hydrodynamics.
+
+    SCENE is the name of a shipped scene (see `vesselflow scenes`), a scene's .toml file, or the
+    folder of one.
+    """
+
+
+@cli.command()
+@click.argument("scene_name", metavar="SCENE")
+@click.option("--frames", type=click.IntRange(min=1), help="Number of frames to simulate.")
+@click.option(
+    "--until",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Simulated time to stop at [s].  [default: the scene's duration]",
+)
+@arch_option
+@threads_option
+@precision_option
+@click.option("--rrd", type=output_path, metavar="FILE", help="Record to a Rerun file.")
+@click.option(
+    "--live",
+    is_flag=False,
+    flag_value=str(LIVE_PORT),
+    type=click.IntRange(1, 65535),
+    metavar="[PORT]",
+    help=f"Serve a live view on loopback.  [default port: {LIVE_PORT}]",
+)
+@click.option(
+    "--every",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Show the particles of every N-th frame; plots have all frames.",
+)
+@click.option("--summary", type=output_path, metavar="FILE", help="Write the summary as JSON.")
+@click.option(
+    "--particles",
+    type=click.IntRange(min=1),
+    help="Blood particles, instead of the scene's column.",
+)
+@click.option(
+    "--height",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="METRES",
+    help="Height of the column [m], instead of the scene's.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def run(
+    scene_name: str,
+    frames: int | None,
+    until: float | None,
+    arch: str,
+    threads: int | None,
+    precision: str,
+    rrd: Path | None,
+    live: int | None,
+    every: int,
+    summary: Path | None,
+    particles: int | None,
+    height: float | None,
+    seed: int,
+) -> int:
+    """Simulate a scene."""
+    from app.output import check_output, write_json
+    from app.scenes import find_scene
+
+    if frames is not None and until is not None:
+        raise InputError("--frames and --until: give one of the two")
+    scene = with_column(find_scene(scene_name), particles, height)
+    end = until or (frames * scene.frame_interval if frames else scene.duration)
+    if rrd is not None:
+        check_output(rrd, "--rrd", b"RRF2")
+    if summary is not None:
+        check_output(summary, "--summary", b"{")
+    if rrd is None and live is None and every > 1:
+        raise InputError("--every: nothing is shown without --rrd or --live")
+
+    from app.drive import drive
+    from app.progress import Progress
+    from taichi_sph.runtime import start
+    from taichi_sph.simulation import Simulation
+
+    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
+        start(arch, precision, threads, random_seed=seed)
+    simulation = Simulation.from_scene(scene, seed=seed)
+    view = None
+    if rrd is not None or live is not None:
+        from app.view import RerunView
+
+        facts = {"arch": arch, "precision": precision, "seed": seed, "version": version()}
+        view = RerunView(simulation, rrd, live, every, facts)
+        if view.live:
+            click.echo(f"live view: rerun --connect {view.live.url}", err=True)
+    outcome = drive(
+        simulation, [view] if view else [], end, scene.frame_interval, Progress(end, scene.name)
+    )
+    click.echo(summary_text(outcome.summary))
+    if rrd is not None and not isinstance(outcome.error, OSError):
+        click.echo(
+            f"recording: {rrd} ({rrd.stat().st_size / 1e6:.1f} MB); see it with: rerun {rrd}"
+        )
+    if summary is not None:
+        write_json(summary, outcome.as_json)
+    if outcome.error:
+        raise outcome.error
+    return 128 + outcome.signal if outcome.signal else 0
+
+
+def with_column(scene: "Scene", particles: int | None, height: float | None) -> "Scene":
+    """The scene with another column, where one is asked for."""
+    import msgspec
+
+    if particles is None and height is None:
+        return scene
+    if particles is not None and height is not None:
+        raise InputError("--particles and --height: give one of the two")
+    column = msgspec.structs.replace(scene.column, particles=particles, height=height)
+    return msgspec.structs.replace(scene, column=column)
+
+
+def summary_text(summary: "Summary") -> str:
+    """The summary of a run for people."""
+    s = summary
+    return (
+        f"{s.scene}: {s.ending}\n"
+        f"  {s.simulated_time:.6g} s simulated in {s.frames} frames and {s.steps} steps\n"
+        f"  {s.wall_time:.1f} s of wall time, {s.real_time_factor:.3g} x real time, "
+        f"{s.median_step_ms:.3g} ms a step (median)\n"
+        f"  {s.particles} of {s.blood_particles} blood particles left, "
+        f"{1e6 * s.drained_volume:.3g} ml drained; {s.proxy_particles} proxies\n"
+        f"  leaks {s.leaks} (most {s.most_leaks}), wall corrections {s.wall_corrections}\n"
+        f"  compression {1e2 * s.compression_p99:.2f} % (99th percentile; "
+        f"most {1e2 * s.most_compression_p99:.2f} %), kinetic energy {s.kinetic_energy:.3g} J"
+    )
+
+
+@cli.command()
+def scenes() -> None:
+    """List the shipped scenes."""
+    from app.scenes import scenes_table
+
+    console().print(scenes_table())
+
+
+@cli.command()
+@click.argument("scene_name", metavar="SCENE")
+def info(scene_name: str) -> None:
+    """Check a scene's vessel and print the numbers that follow from the scene."""
+    from app.scenes import find_scene, info_tables
+
+    out = console()
+    for table in info_tables(find_scene(scene_name)):
+        out.print(table)
+
+
+@cli.command()
+@click.argument("surface", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=output_path, metavar="FOLDER", help="Folder to make.  [default: the file's name]"
+)
+@click.option(
+    "--scale",
+    type=float,
+    metavar="METRES",
+    help="Metres per unit of the file.  [default: guessed from the size]",
+)
+@click.option(
+    "--spacing",
+    type=float,
+    metavar="METRES",
+    help="Distance between blood particles [m].  [default: fits the narrowest place]",
+)
+def new(surface: Path, out: Path | None, scale: float | None, spacing: float | None) -> None:
+    """Make a scene folder of a vessel's surface (STL, PLY, OBJ), capped or open."""
+    from app.new import create_scene
+
+    click.echo(create_scene(surface, out, scale, spacing))
+
+
+@cli.command(context_settings={"ignore_unknown_options": True}, add_help_option=False)
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def validate(arguments: tuple[str, ...]) -> int | None:
+    """Compare the physics with theory and print a table (minutes)."""
+    from app import validate as validation
+
+    return validation.main(list(arguments))
+
+
+@cli.command()
+@click.argument("scene_names", metavar="[SCENE]...", nargs=-1)
+@arch_option
+@threads_option
+@click.option("--peer", is_flag=True, help="Measure SPlisHSPlasH beside, on a like column.")
+@click.option("--scale", is_flag=True, help="Measure from 16 000 to 250 000 particles.")
+@click.option("--start-up", is_flag=True, help="Measure the time to the first frame.")
+@click.option(
+    "--json", "json_file", type=output_path, metavar="FILE", help="Write figures as JSON."
+)
+def bench(
+    scene_names: tuple[str, ...],
+    arch: str,
+    threads: int | None,
+    peer: bool,
+    scale: bool,
+    start_up: bool,
+    json_file: Path | None,
+) -> int:
+    """Measure the speed on scenes (A by default)."""
+    from app import bench as benchmark
+    from app.output import check_output
+    from app.scenes import scene_path
+
+    if json_file is not None:
+        check_output(json_file, "--json", b"{")
+    scenes = [scene_path(name) for name in scene_names or ("A",)]
+    return benchmark.main(scenes, arch, threads, peer, scale, start_up, json_file)
+
+
+def console() -> "Console":
+    """Standard output; wide where it is no terminal, so that nothing is cut."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=140)
+
+
+def one_sentence(error: OSError) -> str:
+    """An operating-system error as its file and reason."""
+    if error.strerror is None:
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+
+
+def invoke(arguments: Sequence[str] | None) -> tuple[str, int]:
+    """Run the command; the message to end with, if any, and the exit code."""
+    try:
+        code = cli.main(arguments, prog_name="vesselflow", standalone_mode=False)
+        sys.stdout.flush()
+        return "", code if isinstance(code, int) else 0
+    except InputError as error:
+        return str(error), 2
+    except RunError as error:
+        return str(error), 1
+    except BrokenPipeError:
+        # Who read the output has had enough, as in `vesselflow scenes | head -1`.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return "", 1
+    except OSError as error:
+        return one_sentence(error), 2
+    except click.ClickException as error:
+        return error.format_message(), error.exit_code
+    except click.Abort:
+        return "stopped by SIGINT", 130
+
+
+def leave(message: str, code: int, at_once: bool = False) -> NoReturn:
+    """End the process; at once, if libraries would wait for somebody else at Python's exit."""
+    if message:
+        click.echo(message, err=True)
+    if at_once:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """The command `vesselflow`."""
+    # Before Taichi's import: no banner, and no question to its server for a newer version.
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    message, code = invoke(arguments)
+    view = sys.modules.get("app.view")
+    leave(message, code, at_once=view is not None and view.viewer_stalled())

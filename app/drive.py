@@ -1,0 +1,231 @@
+"""The loop of a run: advance, observe, report; and how it ends."""
+
+import math
+import signal
+import statistics
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Protocol
+
+from app.progress import Progress
+from taichi_sph.errors import RunError
+
+if TYPE_CHECKING:
+    from taichi_sph.diagnostics import Diagnostics
+    from taichi_sph.simulation import Simulation
+
+
+class Observer(Protocol):
+    """Something that looks at every frame."""
+
+    def on_frame(self, simulation: "Simulation", frame: int, figures: "Diagnostics") -> None:
+        """Take what is wanted of this frame; copies, for the state moves on."""
+
+    def close(self, ending: str) -> None:
+        """Finish the output; `ending` is a sentence about how the run ended."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What is left to say about a run when it has ended."""
+
+    scene: str
+    model: str
+    blood_particles: int
+    """At the start."""
+    proxy_particles: int
+    steps: int
+    frames: int
+    """Frames after the initial state."""
+    simulated_time: float
+    """[s]"""
+    wall_time: float
+    """Of the loop, observers and compilation included [s]."""
+    median_step_ms: float
+    """Median over the frames of the time a step took, without observers [ms]."""
+    real_time_factor: float
+    """Simulated time over wall time."""
+    leaks: int
+    """At the last frame; `most_leaks` is the worst of all frames."""
+    most_leaks: int
+    wall_corrections: int
+    compression_p99: float
+    """99th percentile of max(rho/rho_0 - 1, 0) at the last frame."""
+    most_compression_p99: float
+    kinetic_energy: float
+    """[J]"""
+    particles: int
+    """Live at the end."""
+    drained_volume: float
+    """[m^3]"""
+    diverged: bool
+    ending: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A summary, and what ended the run early, if anything did."""
+
+    summary: Summary
+    error: RunError | OSError | None = None
+    signal: int | None = None
+
+    @property
+    def as_json(self) -> dict[str, Any]:
+        """The summary as a plain dictionary."""
+        return asdict(self.summary)
+
+
+class _Stop(BaseException):
+    """Ctrl-C or SIGTERM came while the simulation was advancing."""
+
+
+class _Signals:
+    """SIGINT and SIGTERM as an orderly end; a second one ends at once."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._interruptible = False
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        self.received = number
+        signal.signal(number, signal.SIG_DFL)
+        if self._interruptible:
+            raise _Stop
+
+    @contextmanager
+    def caught(self) -> Iterator[None]:
+        """Handle both signals meanwhile (Python allows it in the main thread only)."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    @contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """A signal in here raises; elsewhere it waits, so that no output is cut in two."""
+        if self.received is not None:
+            raise _Stop
+        self._interruptible = True
+        try:
+            yield
+        finally:
+            self._interruptible = False
+
+
+def frame_time(frame: int, frame_interval: float, until: float) -> float:
+    """Simulated time of a frame [s]: a product, since sums drift; the last one is `until`."""
+    time = frame * frame_interval
+    # Half a millionth of a frame is rounding, not another frame.
+    return until if time > until - 5e-7 * frame_interval else time
+
+
+def model_name(model: object) -> str:
+    """What the summary calls the accelerations' source: sph, pcnet."""
+    return type(model).__name__.removesuffix("Acceleration").lower()
+
+
+def drive(
+    simulation: "Simulation",
+    observers: Sequence[Observer],
+    until: float,
+    frame_interval: float,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Run a simulation to a time, showing every frame to every observer.
+
+    Args:
+        simulation: at its start.
+        observers: closed by the end of this, however the run ends.
+        until: simulated time [s] to stop at; a vessel that has run empty ends it earlier.
+        frame_interval: simulated time between frames [s].
+        progress: where the state of the run is shown; nowhere if None.
+
+    Returns:
+        the summary; with the error of a run that diverged or could not write its output, or the
+        signal that ended it.
+    """
+    scene, derived = simulation.scene, simulation.derived
+    signals = _Signals()
+    error: RunError | OSError | None = None
+    stopped: int | None = None
+    step_times: list[float] = []
+    most_leaks, most_compression = 0, 0.0
+    began = time.perf_counter()
+    frame = 0
+    with signals.caught():
+        figures = simulation.diagnostics()
+        steps = simulation.steps
+        try:
+            while True:
+                most_leaks = max(most_leaks, figures.leaks)
+                most_compression = max(most_compression, figures.compression_p99)
+                for observer in observers:
+                    observer.on_frame(simulation, frame, figures)
+                if progress:
+                    progress.show(figures.time, simulation.steps, figures.leaks)
+                if figures.time >= until or figures.particles == 0:
+                    break
+                before = time.perf_counter()
+                with signals.interruptible():
+                    simulation.advance_to(frame_time(frame + 1, frame_interval, until))
+                took = time.perf_counter() - before
+                if simulation.steps > steps:
+                    step_times.append(took / (simulation.steps - steps))
+                figures = simulation.diagnostics()
+                steps = simulation.steps
+                frame += 1
+            drained = figures.particles == 0 and figures.time < until
+            ending = "all blood has left the vessel" if drained else "finished"
+        except _Stop:
+            stopped = signals.received
+            assert stopped is not None
+            ending = f"stopped by {signal.Signals(stopped).name}"
+        except (RunError, OSError) as caught:
+            error, ending = caught, str(caught)
+        except BaseException as unforeseen:
+            for observer in observers:
+                observer.close(f"failed: {unforeseen}")
+            raise
+        finally:
+            if progress:
+                progress.close()
+        for observer in observers:
+            try:
+                observer.close(ending)
+            except OSError as caught:
+                if error is None:
+                    error, ending = caught, str(caught)
+    wall_time = time.perf_counter() - began
+    summary = Summary(
+        scene=scene.name,
+        model=model_name(simulation.model),
+        blood_particles=derived.blood_particles,
+        proxy_particles=derived.proxy_particles,
+        steps=steps,
+        frames=frame,
+        simulated_time=figures.time,
+        wall_time=wall_time,
+        median_step_ms=1e3 * statistics.median(step_times) if step_times else math.nan,
+        real_time_factor=figures.time / wall_time,
+        leaks=figures.leaks,
+        most_leaks=most_leaks,
+        wall_corrections=figures.wall_corrections,
+        compression_p99=figures.compression_p99,
+        most_compression_p99=most_compression,
+        kinetic_energy=figures.kinetic_energy,
+        particles=figures.particles,
+        drained_volume=figures.drained_volume,
+        diverged=isinstance(error, RunError),
+        ending=ending,
+    )
+    return Outcome(summary, error, stopped)

@@ -1,0 +1,69 @@
+"""Files that a run leaves: checked before the slow part, written whole or not at all."""
+
+import json
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from taichi_sph.errors import InputError
+
+
+def check_output(path: Path, option: str, begins: bytes) -> None:
+    """Refuse an output path that cannot be written, or that holds something else.
+
+    Args:
+        path: where the file is to be.
+        option: what the message calls it.
+        begins: first bytes of a file of this kind; only such a one, or an empty one, is replaced.
+
+    Raises:
+        InputError: the path is of no use.
+    """
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; give a file")
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: the folder {path.parent} does not exist")
+    try:
+        if path.is_file():
+            with path.open("rb+") as file:
+                first = file.read(len(begins))
+            if first and first != begins:
+                raise InputError(
+                    f"{option} {path}: the file exists and is something else; name another"
+                )
+        elif not path.exists():
+            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+                pass
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot be written: {error.strerror}") from None
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write a JSON file so that it is either the old one or the whole new one.
+
+    Raises:
+        OSError: the disk is full, or the folder is gone.
+    """
+    plain = {
+        key: None if isinstance(item, float) and not math.isfinite(item) else item
+        for key, item in value.items()
+    }
+    text = json.dumps(plain, indent=2, allow_nan=False) + "\n"
+    if path.exists() and not path.is_file():
+        path.write_text(text)  # a device or a pipe: nothing to replace
+        return
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(name, 0o666 & ~umask)
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise

@@ -1,0 +1,73 @@
+"""How far a run is: a bar on a terminal, now and then a line elsewhere."""
+
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+
+LINE_EVERY = 5.0
+"""Least wall time between two plain lines [s]."""
+
+
+def duration(seconds: float) -> str:
+    """Wall time for people: 42 s, 3 min 05 s, 2 h 10 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+class Progress:
+    """Simulated time, real-time factor and time left, on stderr."""
+
+    def __init__(self, until: float, title: str, console: Console | None = None):
+        """Show a run to a simulated time [s]."""
+        self.until = until
+        self._console = console or Console(file=sys.stderr)
+        self._reference: tuple[float, float] | None = None
+        self._shown = -1e9
+        self._bar: Bar | None = None
+        if self._console.is_terminal:
+            self._bar = Bar(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[state]}"),
+                TimeElapsedColumn(),
+                console=self._console,
+            )
+            self._task = self._bar.add_task(title, total=until, state="compiling")
+            self._bar.start()
+
+    def rate(self, simulated: float, now: float) -> float | None:
+        """Simulated over wall time since the first frame, whose compilation does not count."""
+        if self._reference is None:
+            if simulated > 0.0:
+                self._reference = (simulated, now)
+            return None
+        start, at = self._reference
+        return (simulated - start) / (now - at) if now > at and simulated > start else None
+
+    def show(self, simulated: float, steps: int, leaks: int) -> None:
+        """Show a frame: simulated time [s], steps so far, leaks."""
+        now = time.perf_counter()
+        rate = self.rate(simulated, now)
+        state = f"{simulated:.4f} of {self.until:.4g} s, {steps} steps"
+        if rate:
+            left = duration((self.until - simulated) / rate)
+            state += f", {rate:.3g} x real time, {left} left"
+        if leaks:
+            state += f", {leaks} leaks"
+        if self._bar:
+            self._bar.update(self._task, completed=simulated, state=state)
+        elif now - self._shown >= LINE_EVERY and simulated < self.until:
+            self._console.print(state, soft_wrap=True, highlight=False)
+            self._shown = now
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar:
+            self._bar.stop()

@@ -1,0 +1,32 @@
+"""Make the shipped lumen surfaces again from their tables: python -m app.remake [NAME ...]."""
+
+import sys
+import time
+from pathlib import Path
+
+from taichi_sph.centreline import remake
+from taichi_sph.errors import InputError
+
+VESSELS = Path(__file__).resolve().parent.parent / "assets" / "vessels"
+
+
+def main(names: list[str]) -> int:
+    """Make the named vessels, or all that have a table; return the exit code."""
+    known = sorted(path.parent.name for path in VESSELS.glob("*/centreline.json"))
+    for name in names or known:
+        if name not in known:
+            print(f"{name}: no such vessel; allowed: {', '.join(known)}", file=sys.stderr)
+            return 2
+        begin = time.perf_counter()
+        try:
+            triangles, volume = remake(VESSELS / name)
+        except InputError as error:
+            print(error, file=sys.stderr)
+            return 2
+        wall_time = time.perf_counter() - begin
+        print(f"{name}: {triangles} triangles, {volume * 1e6:.4g} ml, {wall_time:.1f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
