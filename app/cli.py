@@ -249,13 +249,19 @@ def new(surface: Path, out: Path | None, scale: float | None, spacing: float | N
     click.echo(create_scene(surface, out, scale, spacing))
 
 
-@cli.command(context_settings={"ignore_unknown_options": True}, add_help_option=False)
-@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
-def validate(arguments: tuple[str, ...]) -> int | None:
+@cli.command()
+@click.argument("cases", metavar="[CASE]...", nargs=-1)
+@click.option("--plot", type=output_path, metavar="FOLDER", help="Draw the profiles there.")
+@click.option("--quick", is_flag=True, help="Coarser and fewer cases.")
+@arch_option
+@threads_option
+def validate(
+    cases: tuple[str, ...], plot: Path | None, quick: bool, arch: str, threads: int | None
+) -> int:
     """Compare the physics with theory and print a table (minutes)."""
     from app import validate as validation
 
-    return validation.main(list(arguments))
+    return validation.main(list(cases) or None, plot, quick, arch, threads)
 
 
 @cli.command()

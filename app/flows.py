@@ -270,7 +270,8 @@ def column(liquid: Liquid, layers: int, gravity: float) -> Motion:
     floor[:, 2] = -liquid.fluid().calibration.setback
     reach = 2.0 * liquid.kernel.support_radius
     return make_motion(
-        liquid, lattice((SLAB, SLAB, layers), d), None, floor, np.tile([0.0, 0.0, -1.0], (len(floor), 1)),
+        liquid, lattice((SLAB, SLAB, layers), d), None,
+        floor, np.tile([0.0, 0.0, -1.0], (len(floor), 1)),
         (np.array([0.0, 0.0, -reach]), np.array([side, side, layers * d + reach])),
         np.array([side, side, 0.0]), (0.0, 0.0, -gravity),
     )  # fmt: skip

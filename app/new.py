@@ -36,6 +36,9 @@ ACROSS, LEAST = 8.0, 6.0
 FEWEST, MOST = 3000, 6000
 """Blood particles that a new scene aims at."""
 
+DEEP = 2.5
+"""Depth of a new scene's column, over its opening's radius."""
+
 
 def create_scene(
     path: Path, out: Path | None = None, scale: float | None = None, spacing: float | None = None
@@ -200,9 +203,11 @@ def _column(vessel: Vessel, spacing: float | None, notes: list[str]) -> tuple[fl
     top = vessel.openings[0]
     if spacing is None:
         spacing = vessel.narrowest / ACROSS
-        # A wide opening above a narrow way: coarser, or the column would be a mere film.
-        least = (0.9 * top.area * 2.0 * top.radius / MOST) ** (1 / 3)
-        spacing = min(max(spacing, least), vessel.narrowest / LEAST)
+        # A wide opening above a narrow way: coarser, or the column would be a mere film; a vessel
+        # without narrow places: finer, or it would be a handful of particles.
+        coarse = (0.9 * top.area * 2.0 * top.radius / MOST) ** (1 / 3)
+        fine = (0.9 * top.area * DEEP * top.radius / FEWEST) ** (1 / 3)
+        spacing = min(max(spacing, coarse), vessel.narrowest / LEAST, fine)
         spacing = _round_down(spacing)
         reason = "chosen"
     else:
@@ -215,7 +220,7 @@ def _column(vessel: Vessel, spacing: float | None, notes: list[str]) -> tuple[fl
     )
     # As deep as a little over the opening is wide, within the bounds; at any rate one radius.
     radius_deep = 0.9 * top.area * top.radius / spacing**3
-    wanted = round(max(min(2.5 * radius_deep, MOST), FEWEST, radius_deep))
+    wanted = round(max(min(DEEP * radius_deep, MOST), FEWEST, radius_deep))
     while True:
         try:
             blood = vessel.fill_column(Column(opening=top.name, particles=wanted), spacing)

@@ -68,9 +68,7 @@ class Fluid:
     @property
     def signal(self) -> float:
         """alpha h_s c [m^2/s] of the artificial viscosity."""
-        return (
-            self.artificial_viscosity * self.kernel.smoothing_length * self.state.sound_speed
-        )
+        return self.artificial_viscosity * self.kernel.smoothing_length * self.state.sound_speed
 
 
 class SphAcceleration:
@@ -96,9 +94,7 @@ class SphAcceleration:
         gravity: tuple[float, float, float],
     ) -> None:
         """Density, pressure and viscosity of each particle, then its acceleration."""
-        sum_density(
-            particles, wall, neighbors, self.fluid, self.pressure_term, self.viscosity
-        )
+        sum_density(particles, wall, neighbors, self.fluid, self.pressure_term, self.viscosity)
         if self.fluid.nested:
             sum_stress(particles, wall, neighbors, self.fluid, self.viscosity, self.stress)
         sum_acceleration(

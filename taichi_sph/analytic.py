@@ -19,9 +19,7 @@ CHANNEL_TERMS = 200
 """Terms of the plane start-up series."""
 
 
-def pipe_speed(
-    r: np.ndarray, radius: float, drive: float, viscosity: float
-) -> np.ndarray:
+def pipe_speed(r: np.ndarray, radius: float, drive: float, viscosity: float) -> np.ndarray:
     """Steady Poiseuille flow in a round pipe, u = G (R^2 - r^2)/(4 mu) [m/s].
 
     Batchelor, An Introduction to Fluid Dynamics (1967), section 4.2.
@@ -65,7 +63,7 @@ def channel_start_up(
 
 
 def plug_ratio(wall_shear_rate: float, eta: float, tau_y: float) -> float:
-    """beta = tau_y/tau_w = plug radius over pipe radius at a wall shear rate [1/s]."""
+    """Return beta = tau_y/tau_w = plug radius over pipe radius at a wall shear rate [1/s]."""
     s = math.sqrt(tau_y / (eta * wall_shear_rate))
     return (s / (1.0 + s)) ** 2
 
@@ -102,7 +100,7 @@ def casson_pipe_flow_rate(radius: float, drive: float, eta: float, tau_y: float)
 
 
 def regularised_casson(shear_rate: float, eta: float, tau_y: float, n: float) -> float:
-    """mu = (sqrt(eta) + sqrt(tau_y/g) (1 - exp(-sqrt(n g))))^2 [Pa s], the law that is solved.
+    """The law that is solved, mu = (sqrt(eta) + sqrt(tau_y/g) (1 - e^-sqrt(n g)))^2 [Pa s].
 
     Papanastasiou (1987), doi:10.1122/1.549926, for Casson's law.
     """

@@ -225,39 +225,46 @@ class _Swept:
             beyond[:, :3] += share * rows[-1, 3] * np.array(end.normal)
             rows = np.concatenate([rows, beyond])
         start, stop = rows[:-1], rows[1:]
-        self.start, self.along = start[:, :3], stop[:, :3] - start[:, :3]
-        self.square = np.einsum("ij,ij->i", self.along, self.along)
+        along = stop[:, :3] - start[:, :3]
+        self.start, self.length = start[:, :3], np.linalg.norm(along, axis=1)
         self.radius, self.growth = start[:, 3], stop[:, 3] - start[:, 3]
-        self.tangent = surface.unit(self.along)
+        self.tangent = surface.unit(along)
         out = 0.5 * (start[:, 4:] + stop[:, 4:])
         out = out - np.einsum("ij,ij->i", out, self.tangent)[:, None] * self.tangent
         self.stretch = np.exp(0.5 * np.linalg.norm(out, axis=1))
         self.major = surface.unit(out)
-        self.middles = cKDTree(start[:, :3] + 0.5 * self.along)
+        self.middles = cKDTree(start[:, :3] + 0.5 * along)
 
     def __call__(self, points: Floats) -> Floats:
         """Distance of points (k, 3) [mm], exact to first order at the surface, (k,)."""
+        chunks = np.array_split(points, len(points) // 20_000 + 1)
+        return np.concatenate([self._distance(chunk) for chunk in chunks])
+
+    def _distance(self, points: Floats) -> Floats:
         # The cones are short, a quarter radius: the nearest ones hold the foot of every point.
         count = min(_NEAREST, len(self.start))
         near = self.middles.query(points, k=count)[1].reshape(len(points), count)
-        result = np.full(len(points), np.inf)
-        for s in near.T:
-            apart = points - self.start[s]
-            share = np.einsum("ij,ij->i", apart, self.along[s]) / self.square[s]
-            share = np.clip(share, 0.0, 1.0)
-            apart -= share[:, None] * self.along[s]
-            radius = self.radius[s] + share * self.growth[s]
-            # Ellipsoid of semi-axes r a, r / a, r: distance (f - 1) f / |grad f| (Taubin).
-            a = self.stretch[s]
-            u = np.einsum("ij,ij->i", apart, self.major[s]) ** 2
-            w = np.einsum("ij,ij->i", apart, self.tangent[s]) ** 2
-            v = np.maximum(np.einsum("ij,ij->i", apart, apart) - u - w, 0.0)
-            size = np.sqrt(u / a**2 + v * a**2 + w) / radius
-            slope = np.sqrt(u / a**4 + v * a**4 + w) / radius
-            # On the axis the quotient is undetermined; the minor axis is the distance there.
-            ratio = np.where(slope > 1e-9, size / np.maximum(slope, 1e-9), 1.0 / a)
-            np.minimum(result, np.maximum((size - 1.0) * ratio, -1.0) * radius, out=result)
-        return result
+
+        def component(directions: Floats) -> Floats:
+            """Of the way from each cone's start, along its direction, (k, count)."""
+            offset = np.einsum("ij,ij->i", self.start, directions)
+            return np.take_along_axis(points @ directions.T - offset, near, axis=1)
+
+        axial = component(self.tangent)
+        u = component(self.major) ** 2
+        square = ((points[:, None] - self.start[near]) ** 2).sum(axis=2)
+        v = np.maximum(square - axial**2 - u, 0.0)
+        length = self.length[near]
+        share = np.clip(axial / length, 0.0, 1.0)
+        w = (axial - share * length) ** 2
+        radius = self.radius[near] + share * self.growth[near]
+        # Ellipsoid of semi-axes r a, r / a, r: distance (f - 1) f / |grad f| (Taubin).
+        a = self.stretch[near] ** 2
+        size = np.sqrt(u / a + v * a + w) / radius
+        slope = np.sqrt(u / a**2 + v * a**2 + w) / radius
+        # On the axis the quotient is undetermined; the minor axis is the distance there.
+        ratio = np.where(slope > 1e-9, size / np.maximum(slope, 1e-9), 1.0 / np.sqrt(a))
+        return (np.maximum((size - 1.0) * ratio, -1.0) * radius).min(axis=1)
 
 
 class _Union:
@@ -334,6 +341,7 @@ def _branching(shape: Centrelines) -> tuple[Floats, Integers]:
         vertices = distance.settle(_relax(vertices, faces, free), faces, edge)
     for end in shape.openings:
         vertices, faces = _cut(vertices, faces, end, distance, edge)
+    faces = _merge_short_rims(vertices, faces, 0.35 * edge)
     vertices, faces = surface.drop_unused(vertices, faces)
     # What the cuts left uneven is relaxed; the rims stay.
     free = np.ones(len(vertices), bool)
@@ -346,12 +354,37 @@ def _branching(shape: Centrelines) -> tuple[Floats, Integers]:
     return _cap_all(vertices, faces)
 
 
+def _merge_short_rims(vertices: Floats, faces: Integers, least: float) -> Integers:
+    """Merge neighbours on a rim that are closer than `least` [mm]; the new triangles."""
+    for loop in surface.boundary_loops(faces):
+        goal = np.arange(len(vertices))
+        before = loop[-1]
+        for k, here in enumerate(loop):
+            after = loop[(k + 1) % len(loop)]
+            # Two merged edges never touch, so that each merge is of one triangle's edge.
+            short = np.linalg.norm(vertices[here] - vertices[after]) < least
+            if short and goal[here] == here and goal[before] == before and after != loop[0]:
+                goal[after] = here
+            before = here
+        faces = goal[faces]
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]
+    return faces
+
+
 def _march(distance: _Union, shape: Centrelines, size: float) -> tuple[Floats, Integers]:
     """Marching cubes on a grid of that size [mm], exact values near the surface only."""
-    stations = np.concatenate([np.array(branch.points) for branch in shape.branches])
-    margin = 2.5 * stations[:, 3].max()
-    low = (stations[:, :3] - margin).min(axis=0)
-    high = (stations[:, :3] + margin).max(axis=0)
+    # Balls that hold the branches (1.6 for the major axis and the smooth union), their prolonged
+    # ends and the bulges.
+    balls = np.concatenate(
+        [
+            *(np.array(branch.points) * [1, 1, 1, 1.6] for branch in shape.branches),
+            *(np.array([(*end.centre, 2.5 * end.radius)]) for end in shape.openings),
+            *(np.array([bulge.sphere]) * [1, 1, 1, 1.6] for bulge in shape.extras),
+        ]
+    )
+    low = (balls[:, :3] - balls[:, 3:]).min(axis=0)
+    high = (balls[:, :3] + balls[:, 3:]).max(axis=0)
     factor = 3
     coarse_shape = np.ceil((high - low) / (factor * size)).astype(int) + 1
     coarse = low + factor * size * np.moveaxis(np.indices(coarse_shape), 0, -1)
@@ -359,7 +392,7 @@ def _march(distance: _Union, shape: Centrelines, size: float) -> tuple[Floats, I
     fine_shape = factor * (coarse_shape - 1) + 1
     fine = ndimage.zoom(values, fine_shape / coarse_shape, order=1)
     # A fine node is evaluated where the surface may pass beside it, by its nearest coarse node.
-    near = np.abs(values) < (1.25 * 0.5 * math.sqrt(3) * factor + 1.5) * size
+    near = np.abs(values) < (0.5 * math.sqrt(3) * factor + 1.4) * size
     near_fine = ndimage.zoom(near.astype(np.uint8), fine_shape / coarse_shape, order=0) > 0
     index = np.argwhere(near_fine)
     fine[near_fine] = distance(low + size * index)

@@ -3,7 +3,7 @@
 import taichi as ti
 
 WALL_MARGIN = 0.1
-"""Blood may come this close to the lumen surface [setbacks]; at rest it keeps one setback."""
+"""Blood may come this close to the lumen surface [setbacks]; at rest it keeps some 0.5."""
 
 WALL_SIDE = 0.5
 """A proxy guards only blood that was on its side before the step, to this depth [setbacks]:

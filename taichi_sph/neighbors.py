@@ -91,7 +91,7 @@ def make_grid(
     extent = np.where(period > 0.0, period, np.asarray(upper) - np.asarray(lower))
     edge = radius / reach
     if np.any((period > 0.0) & (period < (2 * reach + 1) * edge)):
-        raise ValueError("a periodic axis must be at least three list radii long")
+        raise ValueError(f"a periodic axis must be at least {2 * reach + 1} cells long")
     shape = np.maximum(1, np.floor(extent / edge * (1.0 + 1e-9))).astype(int)
     shape = np.where(period > 0.0, shape, shape + 1)
     cell = np.where(period > 0.0, extent / shape, edge)
@@ -100,13 +100,11 @@ def make_grid(
             f"the neighbour grid would need {np.prod(shape.astype(float)):.2g} cells: the vessel "
             f"is too large for this spacing; at most 2e8 are allowed"
         )
-    return Grid(
-        tuple(float(v) for v in lower),
-        tuple(float(v) for v in cell),
-        tuple(int(v) for v in shape),
-        tuple(float(v) for v in period),
-        reach,
-    )
+    x, y, z = (float(v) for v in lower)
+    cx, cy, cz = (float(v) for v in cell)
+    nx, ny, nz = (int(v) for v in shape)
+    px, py, pz = (float(v) for v in period)
+    return Grid((x, y, z), (cx, cy, cz), (nx, ny, nz), (px, py, pz), reach)
 
 
 def list_capacity(expected: float) -> int:

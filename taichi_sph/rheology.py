@@ -60,8 +60,8 @@ class Casson:
     @ti.func
     def viscosity(self, shear_rate):
         """mu [Pa s] at a shear rate [1/s]."""
-        # Below 1e-6 1/s the quotient's limit is reached to rounding; 0/0 must not appear.
-        g = ti.max(shear_rate, 1e-6)
+        # Below 1e-12 1/s the quotient's limit is reached to 1e-5; 0/0 must not appear.
+        g = ti.max(shear_rate, 1e-12)
         exponent = self.n * g
         if ti.static(not self.printed):
             exponent = ti.sqrt(exponent)

@@ -6,7 +6,7 @@ Nothing here imports taichi; derived numbers are worked out elsewhere and printe
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal, Union, get_args, get_type_hints
 
 import msgspec
 
@@ -17,9 +17,13 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Vector = tuple[float, float, float]
+LARGEST = 1e12
+"""Nothing in SI units is as large in a vessel; keeps infinity out."""
+
+Positive = Annotated[float, msgspec.Meta(gt=0, lt=LARGEST)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0, lt=LARGEST)]
+Coordinate = Annotated[float, msgspec.Meta(gt=-LARGEST, lt=LARGEST)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -133,10 +137,7 @@ class Scene(_Table):
     """The TOML text as read, kept in recordings (set by the reader)."""
 
     def __post_init__(self) -> None:
-        for name in ("duration", "frame_interval"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} must be finite")
-        if not all(math.isfinite(g) for g in self.gravity) or math.hypot(*self.gravity) > 1e3:
+        if math.hypot(*self.gravity) > 1e3:
             raise ValueError(f"gravity: {self.gravity} m/s^2 is not a plausible body force")
         if self.openings and self.column.opening not in self.openings:
             allowed = ", ".join(self.openings)
@@ -145,10 +146,45 @@ class Scene(_Table):
             )
 
 
-def _plain(error: Exception) -> str:
-    """Msgspec's message without its JSON-path decoration."""
-    text = str(error).replace("`", "")
-    return text.replace(" - at $.", " at ").replace("Object contains u", "u")
+_RHEOLOGIES = {"newtonian": NewtonianTable, "casson": CassonTable}
+_TABLES = {
+    "": Scene,
+    "vessel": VesselTable,
+    "column": Column,
+    "blood": Blood,
+    "discretization": Discretization,
+    "openings": OpeningTable,
+}
+_SET_BY_READER = ("folder", "name", "text")
+
+
+def _plain(error: Exception, table: dict[str, Any]) -> str:
+    """One sentence from msgspec's message: where, what was found, what is allowed."""
+    what, _, path = str(error).replace("`", "").partition(" - at $")
+    path = path.lstrip(".")
+    found: Any = table
+    for part in path.split(".") if path else []:
+        found = found.get(part, {}) if isinstance(found, dict) else {}
+    structure: Any = _TABLES.get(path.split(".")[0] if path.startswith("openings") else path)
+    if path == "blood.rheology" and isinstance(found, dict):
+        structure = _RHEOLOGIES.get(found.get("model", ""))
+    where = f"{path}: " if path else ""
+    if what.startswith("Object contains unknown field"):
+        keys = [k for k in structure.__struct_fields__ if k not in _SET_BY_READER]
+        if path == "blood.rheology":
+            keys.insert(0, "model")
+        return f"{where}unknown key {what.split()[-1]}; allowed: {', '.join(keys)}"
+    if what.startswith("Object missing required field"):
+        return f"{where}the key {what.split()[-1]} is missing"
+    if what.startswith("Invalid"):
+        key = path.rpartition(".")[2]
+        choices: tuple[str, ...] = tuple(_RHEOLOGIES) if key == "model" else ()
+        for each in _TABLES.values():
+            choices = choices or get_args(get_type_hints(each).get(key))
+        return f"{where}found {found!r}; allowed: {', '.join(choices)}"
+    if what.startswith("Expected"):
+        return f"{where}found {found!r}; {what[0].lower()}{what[1:].partition(', got')[0]}"
+    return where + what
 
 
 def parse_scene(text: str, source: str, folder: Path, name: str) -> Scene:
@@ -161,14 +197,24 @@ def parse_scene(text: str, source: str, folder: Path, name: str) -> Scene:
         table: dict[str, Any] = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: not a TOML file: {error}") from None
-    for key in ("folder", "name", "text"):
+    for key in _SET_BY_READER:
         if key in table:
-            raise InputError(f"{source}: unknown key {key!r}")
+            raise InputError(f"{source}: unknown key {key}")
     table |= {"folder": str(folder), "name": name, "text": text}
     try:
+        # One by one, for msgspec does not say which entry of a dictionary is wrong.
+        openings = table.get("openings")
+        for label, opening in openings.items() if isinstance(openings, dict) else ():
+            try:
+                msgspec.convert(opening, OpeningTable)
+            except msgspec.ValidationError as error:
+                place = str(error).replace("$", f"$.openings.{label}")
+                if "$" not in place:
+                    place += f" - at $.openings.{label}"
+                raise msgspec.ValidationError(place) from None
         return msgspec.convert(table, Scene)
     except msgspec.ValidationError as error:
-        raise InputError(f"{source}: {_plain(error)}") from None
+        raise InputError(f"{source}: {_plain(error, table)}") from None
 
 
 def read_scene(path: Path) -> Scene:

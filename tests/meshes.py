@@ -54,7 +54,7 @@ def tables(scale: float = 1.0, **states: str) -> dict[str, OpeningTable]:
 
 def pipe(**states: str) -> Vessel:
     """The cylinder as a vessel."""
-    return build_vessel(*cylinder(), tables(**states), 1.0, "tube.ply")
+    return build_vessel(*cylinder(), tables(1.0, **states), 1.0, "tube.ply")
 
 
 def write_scene(

@@ -11,7 +11,11 @@ from types import TracebackType
 import numpy as np
 import pyarrow
 import rerun_cli
-from rerun.chunk import RrdReader
+
+try:
+    from rerun.chunk import RrdReader
+except ImportError:  # Rerun 0.39, of Python 3.10
+    from rerun.experimental import RrdReader
 
 RERUN = Path(rerun_cli.__file__).with_name("rerun")
 """The program itself; `rerun` on the path is a wrapper that orphans it when killed."""

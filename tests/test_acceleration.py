@@ -41,12 +41,13 @@ DERIVATIVE = {"f64": 1e-6, "f32": 1e-3}
 GRAVITY = (1.0, -2.0, -9.81)
 CASSON = Casson(3.5e-3, 5e-3, 7.0)
 
-PRESSURE = make_fluid(background=50.0)
+# A background above rho_0 c^2/7 keeps the pressure off its bound, however thin blood is.
+PRESSURE = make_fluid(background=300.0)
 # A pressure bounded at zero everywhere leaves the artificial term alone.
 ARTIFICIAL = make_fluid(background=-1e9, alpha=0.3)
 VISCOUS = make_fluid(sound_speed=0.0, rheology=Newtonian(3.5e-3))
-BLOOD = make_fluid(background=50.0, rheology=CASSON, alpha=0.05)
-NESTED = make_fluid(background=50.0, rheology=CASSON, alpha=0.05, nested=True)
+BLOOD = make_fluid(background=300.0, rheology=CASSON, alpha=0.05)
+NESTED = make_fluid(background=300.0, rheology=CASSON, alpha=0.05, nested=True)
 
 CONSERVING = {
     "pressure": PRESSURE,
@@ -100,6 +101,14 @@ def assert_close(found: np.ndarray, expected: np.ndarray, relative: float) -> No
     np.testing.assert_allclose(found, expected, rtol=0, atol=relative * scale)
 
 
+def assert_parts_add_up(found, from_blood, from_wall, place: str) -> None:
+    """The sum of both parts; near a wall each must be large enough to be missed."""
+    if place == "near the wall":
+        parts = np.abs(from_blood).max(), np.abs(from_wall).max()
+        assert min(parts) > 0.01 * max(parts)
+    assert_close(found, from_blood + from_wall, SUMS[precision()])
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_density_is_equation_2(place):
     stage = PLACES[place](0)
@@ -113,8 +122,8 @@ def test_density_is_equation_2(place):
 def test_pressure_acceleration_is_equation_13_and_the_walls_part_equation_15(place):
     stage = PLACES[place](1)
     found, blood = stage.accelerate(PRESSURE), stage.reference(PRESSURE)
-    assert_close(
-        found, blood.pressure_acceleration() + blood.wall_pressure_acceleration(), SUMS[precision()]
+    assert_parts_add_up(
+        found, blood.pressure_acceleration(), blood.wall_pressure_acceleration(), place
     )
 
 
@@ -123,8 +132,9 @@ def test_artificial_acceleration_is_monaghans(place):
     stage = PLACES[place](2)
     found, blood = stage.accelerate(ARTIFICIAL), stage.reference(ARTIFICIAL)
     assert blood.p.max() == 0.0
-    expected = blood.artificial_acceleration() + blood.wall_artificial_acceleration()
-    assert_close(found, expected, SUMS[precision()])
+    assert_parts_add_up(
+        found, blood.artificial_acceleration(), blood.wall_artificial_acceleration(), place
+    )
 
 
 @pytest.mark.parametrize("place", ["near the wall", "filled box"])
@@ -132,8 +142,9 @@ def test_viscous_acceleration_is_morris_and_the_walls_friction_equation_16(place
     stage = PLACES[place](3)
     found, blood = stage.accelerate(VISCOUS), stage.reference(VISCOUS)
     assert blood.p.max() == 0.0
-    expected = blood.viscous_acceleration() + blood.wall_friction_acceleration()
-    assert_close(found, expected, SUMS[precision()])
+    assert_parts_add_up(
+        found, blood.viscous_acceleration(), blood.wall_friction_acceleration(), place
+    )
 
 
 def test_lone_drop_feels_the_walls_pressure_of_equation_15():
@@ -312,7 +323,7 @@ def test_accelerating_twice_gives_bitwise_the_same(fluid):
     np.testing.assert_array_equal(stage.accelerate(fluid, GRAVITY), first)
 
 
-def test_blood_at_rest_on_a_wall_under_its_own_weight_is_pushed_up_by_the_wall_alone():
+def test_lone_drop_close_to_a_plane_wall_is_pushed_off_it():
     stage = plane()
     stage.put(np.array([[4 * D, 4 * D, 0.1 * D]]))
     acceleration = stage.accelerate(PRESSURE)[0]

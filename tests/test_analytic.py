@@ -1,6 +1,7 @@
 """The closed forms against limits, each other and the equations that they solve."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_the_regularised_casson_pipe_tends_to_the_ideal_one():
     errors = []
     for n in (7.0, 1e3, 1e5):
         r, u, rate = analytic.generalised_pipe(
-            RADIUS, drive, lambda g, n=n: analytic.regularised_casson(g, ETA, TAU_Y, n)
+            RADIUS, drive, partial(analytic.regularised_casson, eta=ETA, tau_y=TAU_Y, n=n)
         )
         assert _flow_rate(r, u) == pytest.approx(rate, rel=1e-5)
         errors.append(abs(rate / ideal - 1.0))

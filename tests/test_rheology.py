@@ -16,8 +16,8 @@ RATES = np.logspace(-5, 5, 401)
 SAME = {"f64": 1e-7, "f32": 1e-5}
 """Three terms of the exponential's series leave 1e-2^3/24 of the rise; where the series ends,
 1 - exp(-0.01) in f32 keeps five digits."""
-REST = 3e-3
-"""Rest is evaluated at 1e-6 1/s, where sqrt(n g)/2 of the rise is still missing."""
+REST = 1e-5
+"""Rest is evaluated at 1e-12 1/s, where sqrt(n g)/2 of the rise is still missing."""
 HIGH_SHEAR = {"f64": 1e-12, "f32": 2e-6}
 """exp(-sqrt(7e5)) is nothing: what is left is rounding."""
 SEVEN_DIGITS = 2e-7
