@@ -234,6 +234,14 @@ class _Swept:
         self.stretch = np.exp(0.5 * np.linalg.norm(out, axis=1))
         self.major = surface.unit(out)
         self.middles = cKDTree(start[:, :3] + 0.5 * along)
+        widest = (self.stretch * rows[:, 3].max()).max()
+        self.margin = float(widest + 0.5 * self.length.max())
+        self.least_radius = float((rows[:, 3].min() / self.stretch).min())
+
+    def bounds(self, points: Floats) -> tuple[Floats, Floats]:
+        """Least and greatest value that the distance of points (k, 3) may have [mm], (k,)."""
+        apart = self.middles.query(points)[0]
+        return apart - self.margin, apart - self.least_radius
 
     def __call__(self, points: Floats) -> Floats:
         """Distance of points (k, 3) [mm], exact to first order at the surface, (k,)."""
@@ -291,7 +299,15 @@ class _Union:
 
     def __call__(self, points: Floats) -> Floats:
         """Distance of points (k, 3) [mm], (k,)."""
-        parts = [branch(points) for branch in self.branches]
+        bounds = [branch.bounds(points) for branch in self.branches]
+        # What is further than this counts for nothing in the union: exp(-10).
+        enough = np.min([most for _, most in bounds], axis=0) + 10.0 * self.k
+        parts = []
+        for branch, (least, _) in zip(self.branches, bounds, strict=True):
+            near = least < enough
+            part = enough.copy()
+            part[near] = branch(points[near])
+            parts.append(part)
         parts += [np.linalg.norm(points - s[:3], axis=1) - s[3] for s in self.spheres]
         all_parts = np.stack(parts)
         least = all_parts.min(axis=0)
