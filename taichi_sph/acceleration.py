@@ -16,7 +16,7 @@ from taichi_sph.calibration import Calibration, softening
 from taichi_sph.equation_of_state import Tait
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
-from taichi_sph.rheology import Casson, Newtonian
+from taichi_sph.rheology import Rheology
 from taichi_sph.smoothing_kernels import WendlandC2
 from taichi_sph.wall import Wall
 
@@ -53,7 +53,7 @@ class Fluid:
 
     kernel: WendlandC2
     state: Tait
-    rheology: Newtonian | Casson
+    rheology: Rheology
     calibration: Calibration
     artificial_viscosity: float
     """Monaghan's alpha [-]."""
@@ -67,7 +67,7 @@ class Fluid:
 
     @property
     def signal(self) -> float:
-        """alpha h_s c [m^2/s] of the artificial viscosity."""
+        """Alpha h_s c [m^2/s] of the artificial viscosity."""
         return self.artificial_viscosity * self.kernel.smoothing_length * self.state.sound_speed
 
 
@@ -242,8 +242,9 @@ def sum_acceleration(
                + gamma_mu rho_0 V_k 2 mu_i/rho_i^2 (r_ik . grad W_ik)/(r_ik^2 + eps) v_i
     (Eq. 16 takes the part of v along r_ik: at a wall that lies to one side it would damp motion
     towards the wall some ten times harder than motion along it.)
-    mu_ij is the harmonic mean; Pi_ij = -alpha h_s c (v.r)/(r^2 + eps)/rho where v.r < 0, also at
-    the wall.  Reads: position, velocity, density, scratch.  Writes: acceleration.
+    Both pressure forces carry the gradient's calibration.  mu_ij is the harmonic mean;
+    Pi_ij = -alpha h_s c (v.r)/(r^2 + eps)/rho where v.r < 0, also at the wall.
+    Reads: position, velocity, density, scratch.  Writes: acceleration.
     """
     mass = ti.static(fluid.calibration.mass)
     eps = ti.static(fluid.softening)
@@ -261,13 +262,14 @@ def sum_acceleration(
             slope = fluid.kernel.slope(ti.sqrt(r2))
             v_ij = v_i - p.velocity[j]
             rho_j = p.density[j]
-            push = p_i + pressure_term[j]
+            push = ti.static(fluid.calibration.gradient) * (p_i + pressure_term[j])
             if ti.static(fluid.artificial_viscosity > 0.0):
                 approach = ti.min(0.0, v_ij.dot(r_ij)) / (r2 + eps)
                 push -= ti.static(2.0 * fluid.signal) * approach / (rho_i + rho_j)
             a_i -= (push * slope) * r_ij
             if ti.static(fluid.nested):
-                a_i += slope / (rho_i * rho_j) * ((stress[i] + stress[j]) @ r_ij)
+                factor = ti.static(fluid.calibration.gradient)
+                a_i += (factor * slope / (rho_i * rho_j)) * ((stress[i] + stress[j]) @ r_ij)
             else:
                 mu_ij = mu_i
                 if ti.static(fluid.rheology.shear_dependent):
@@ -281,7 +283,7 @@ def sum_acceleration(
             r_ik = nb.grid.separation(x_i, w.position[k])
             r2 = r_ik.norm_sqr()
             slope = fluid.kernel.slope(ti.sqrt(r2))
-            push = p_i
+            push = ti.static(fluid.calibration.gradient) * p_i
             if ti.static(fluid.artificial_viscosity > 0.0):
                 push -= ti.static(fluid.signal) * ti.min(0.0, v_i.dot(r_ik)) / ((r2 + eps) * rho_i)
             wall -= (ti.static(fluid.calibration.wall_density) * w.volume[k] * push * slope) * r_ik

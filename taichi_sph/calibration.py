@@ -19,11 +19,12 @@ class Calibration:
     """Factors of the discrete sums; dimensionless but for the mass."""
 
     mass: float
-    """Mass m of a blood particle [kg]: rho_0 / sum_lattice W, so that a lattice has rho_0."""
+    """Mass m in the sums [kg]: rho_0 / sum_lattice W, so that a lattice has rho_0.  It is some per
+    cent less than rho_0 d^3, the blood that a particle stands for."""
     viscosity: float
     """Multiplies the pairwise viscous sum: 1 / its response to a long wave."""
     gradient: float
-    """Multiplies the velocity gradient sum: 1 / its response to a linear field."""
+    """Multiplies gradients (pressure, velocity, stress): 1 / the response to a linear field."""
     setback: float
     """How far behind the lumen surface the proxies stand [m]."""
     wall_density: float

@@ -139,6 +139,8 @@ class Neighbors:
     """Where each particle was when the lists were built [m]."""
     row_vector: ti.MatrixField
     row_identity: ti.Field
+    parallel_scan: ti.algorithms.PrefixSumExecutor | None = None
+    """Running sum over cells on CUDA, the only place where Taichi has a parallel one."""
     builds: int = 0
     """How often the lists were built."""
 
@@ -168,6 +170,9 @@ class Neighbors:
             built_position=ti.Vector.field(3, float, capacity),
             row_vector=ti.Vector.field(3, float, capacity),
             row_identity=ti.field(int, capacity),
+            parallel_scan=(
+                ti.algorithms.PrefixSumExecutor(grid.cells + 1) if ti.cfg.arch == ti.cuda else None
+            ),
         )
 
     def sort_wall(self, wall: Wall) -> None:
@@ -192,7 +197,10 @@ class Neighbors:
             RunError: a particle has more neighbours than a list holds.
         """
         count_cells(particles, self)
-        scan(self.cell_start)
+        if self.parallel_scan is None:
+            scan_serial(self.cell_start)
+        else:
+            self.parallel_scan.run(self.cell_start)
         fill_cells(particles, self)
         particles.count[None] = self.cell_start[self.grid.cells]
         sort_cells(particles, self)
@@ -233,20 +241,6 @@ def scan_serial(a: ti.template()):
     for k in range(a.shape[0]):
         total += a[k]
         a[k] = total
-
-
-_scans: dict[int, ti.algorithms.PrefixSumExecutor] = {}
-
-
-def scan(a: ti.Field) -> None:
-    """Running sum in place: serial on the CPU, whose Taichi has no parallel one."""
-    if ti.cfg.arch in (ti.cuda, ti.vulkan):
-        n = a.shape[0]
-        if n not in _scans:
-            _scans[n] = ti.algorithms.PrefixSumExecutor(n)
-        _scans[n].run(a)
-    else:
-        scan_serial(a)
 
 
 @ti.kernel

@@ -18,7 +18,7 @@ class Particles:
     capacity: int
     """Rows allocated."""
     mass: float
-    """Mass m of every particle [kg]."""
+    """Blood that a particle stands for, rho_0 d^3 [kg]."""
     count: ti.Field
     """Number of live particles, 0-D."""
     position: ti.MatrixField

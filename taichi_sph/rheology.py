@@ -25,7 +25,7 @@ class Newtonian:
 
     @ti.func
     def viscosity(self, shear_rate):
-        """mu [Pa s] at a shear rate [1/s]."""
+        """Mu [Pa s] at a shear rate [1/s]."""
         return self.eta
 
 
@@ -59,7 +59,7 @@ class Casson:
 
     @ti.func
     def viscosity(self, shear_rate):
-        """mu [Pa s] at a shear rate [1/s]."""
+        """Mu [Pa s] at a shear rate [1/s]."""
         # Below 1e-12 1/s the quotient's limit is reached to 1e-5; 0/0 must not appear.
         g = ti.max(shear_rate, 1e-12)
         exponent = self.n * g
@@ -73,7 +73,10 @@ class Casson:
         return root * root
 
 
-def rheology_of(table: NewtonianTable | CassonTable) -> Newtonian | Casson:
+Rheology = Newtonian | Casson
+
+
+def rheology_of(table: NewtonianTable | CassonTable) -> Rheology:
     """The viscosity law that a scene asks for."""
     if isinstance(table, NewtonianTable):
         return Newtonian(table.viscosity)

@@ -18,7 +18,7 @@ def start(
     """Start Taichi once per process; fields made before are lost.
 
     Args:
-        arch: "cpu", or "gpu" for the first of CUDA, Vulkan, Metal that works.
+        arch: "cpu", or "gpu" for CUDA or Metal (Vulkan without a driver crashes).
         precision: "f32" or "f64", the type of every `float` in a kernel.
         threads: CPU threads; all by default.
         debug: check bounds of every field access (slow).
@@ -33,7 +33,7 @@ def start(
         raise InputError(f"--precision {precision}: allowed are {', '.join(PRECISIONS)}")
     options = {"cpu_max_num_threads": threads} if threads else {}
     ti.init(
-        arch=ti.gpu if arch == "gpu" else ti.cpu,
+        arch=[ti.cuda, ti.metal] if arch == "gpu" else ti.cpu,
         default_fp=PRECISIONS[precision],
         default_ip=ti.i32,
         # Halves the cost of the sums (square roots, quotients).  It lets the compiler assume that
@@ -47,4 +47,4 @@ def start(
         **options,
     )
     if arch == "gpu" and ti.cfg.arch in (ti.x64, ti.arm64):
-        raise InputError("--arch gpu: no CUDA, Vulkan or Metal device was found; use --arch cpu")
+        raise InputError("--arch gpu: no CUDA or Metal device was found; use --arch cpu")

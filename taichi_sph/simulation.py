@@ -46,10 +46,10 @@ def mark_removed(
         x = p.position[i]
         for k in range(centre.shape[0]):
             r = x - centre[k]
-            if reach[k] > 0.0 and r.dot(normal[k]) > 0.0 and r.norm() < reach[k]:
-                if p.identity[i] >= 0:
-                    p.identity[i] = LOST - 1 - k
-                    ti.atomic_add(removed[k], 1)
+            beyond = reach[k] > 0.0 and r.dot(normal[k]) > 0.0 and r.norm() < reach[k]
+            if beyond and p.identity[i] >= 0:
+                p.identity[i] = LOST - 1 - k
+                ti.atomic_add(removed[k], 1)
         if p.identity[i] >= 0:
             for a in ti.static(range(3)):
                 upper = grid.lower[a] + grid.cell[a] * grid.shape[a]
@@ -88,7 +88,7 @@ class Simulation(Motion):
             artificial_viscosity=scene.blood.artificial_viscosity,
             nested=grid.viscous_form == "nested",
         )
-        particles = Particles.from_numpy(blood, mass=fluid.calibration.mass)
+        particles = Particles.from_numpy(blood, mass=scene.blood.density * grid.spacing**3)
         wall = Wall.from_numpy(sample.positions, sample.normals, kernel, setback, wall_spacing)
         skin = SKIN * kernel.support_radius
         margin = 2.0 * (kernel.support_radius + skin)

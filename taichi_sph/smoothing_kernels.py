@@ -45,7 +45,7 @@ class WendlandC2:
 
     @ti.func
     def slope(self, r):
-        """(dW/dr)/r [1/m^5]: grad W_ij = slope(|r_ij|) r_ij."""
+        """Slope of W over distance, dW/dr / r [1/m^5]; times r_ij it is the gradient of W_ij."""
         s = ti.max(0.0, 1.0 - r * ti.static(1.0 / self.support_radius))
         return self.slope_peak * s * s * s
 

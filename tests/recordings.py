@@ -1,5 +1,7 @@
 """Recordings read back, and a client that reads a live view as slowly as a test wants."""
 
+import importlib
+import importlib.util
 import os
 import socket
 import struct
@@ -12,10 +14,9 @@ import numpy as np
 import pyarrow
 import rerun_cli
 
-try:
-    from rerun.chunk import RrdReader
-except ImportError:  # Rerun 0.39, of Python 3.10
-    from rerun.experimental import RrdReader
+# Rerun 0.39, of Python 3.10, has it elsewhere.
+_CHUNK = "rerun.chunk" if importlib.util.find_spec("rerun.chunk") else "rerun.experimental"
+RrdReader = importlib.import_module(_CHUNK).RrdReader
 
 RERUN = Path(rerun_cli.__file__).with_name("rerun")
 """The program itself; `rerun` on the path is a wrapper that orphans it when killed."""

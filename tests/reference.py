@@ -116,13 +116,16 @@ class Blood:
         return np.maximum(0.0, b * ((rho / self.rest_density) ** 7 - 1.0) + self.background)
 
     def internal_energy(self) -> float:
-        """Sum of m u with du/drho = p/rho^2 [J]; constant where the pressure is bounded."""
+        """Sum of m u with du/drho = p/rho^2 [J]; constant where the pressure is bounded.
+
+        Every pressure force carries the gradient's calibration, so the energy does.
+        """
         b = self.rest_density * self.sound_speed**2 / 7.0
         lowest = self.rest_density * max(0.0, 1.0 - self.background / b) ** (1.0 / 7.0)
         rho = np.maximum(self.rho, lowest)
         c = rho / self.rest_density
         u = b / self.rest_density * (c**6 / 6.0 + 1.0 / c) - self.background / rho
-        return float(self.mass * u.sum())
+        return float(self.factors["gradient"] * self.mass * u.sum())
 
     def kinetic_energy(self) -> float:
         """Sum of m v^2/2 [J]."""
@@ -147,8 +150,8 @@ class Blood:
         return self.mass / self.rest_density
 
     def pressure_acceleration(self) -> np.ndarray:
-        """Eq. 13 [m/s^2]."""
-        q = self.p / self.rho**2
+        """Eq. 13, with the calibration of the gradient [m/s^2]."""
+        q = self.factors["gradient"] * self.p / self.rho**2
         return -self.mass * np.einsum("ij,ija->ia", q[:, None] + q[None, :], self.grad)
 
     def artificial_acceleration(self) -> np.ndarray:
@@ -177,12 +180,19 @@ class Blood:
         total = np.zeros_like(self.x)
         for i in range(len(self.x)):
             pair = (tau[i] + tau) / (self.rho[i] * self.rho)[:, None, None]
-            total[i] = self.mass * np.einsum("jab,jb->a", pair, self.grad[i])
+            total[i] = (
+                self.factors["gradient"] * self.mass * np.einsum("jab,jb->a", pair, self.grad[i])
+            )
         return total
 
     def wall_pressure_acceleration(self) -> np.ndarray:
-        """Eq. 15 with one p_i/rho_i^2 [m/s^2]."""
-        psi = self.factors["wall_density"] * self.rest_density * self.volume
+        """Eq. 15 with one p_i/rho_i^2 and the calibration of the gradient [m/s^2]."""
+        psi = (
+            self.factors["gradient"]
+            * self.factors["wall_density"]
+            * self.rest_density
+            * self.volume
+        )
         return -(self.p / self.rho**2)[:, None] * np.einsum("k,ika->ia", psi, self.grad_wall)
 
     def wall_artificial_acceleration(self) -> np.ndarray:

@@ -18,9 +18,7 @@ def _flow_rate(r, u):
 def test_the_poiseuille_profile_carries_hagen_and_poiseuilles_flow_rate():
     r = np.linspace(0.0, RADIUS, 4001)
     u = analytic.pipe_speed(r, RADIUS, DRIVE, ETA)
-    assert _flow_rate(r, u) == pytest.approx(
-        analytic.pipe_flow_rate(RADIUS, DRIVE, ETA), rel=1e-6
-    )
+    assert _flow_rate(r, u) == pytest.approx(analytic.pipe_flow_rate(RADIUS, DRIVE, ETA), rel=1e-6)
 
 
 def test_pipe_start_up_begins_at_rest_and_ends_steady():

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from meshes import LENGTH, RADIUS, cylinder
 
 from app.new import create_scene
 from taichi_sph import surface
@@ -12,7 +13,6 @@ from taichi_sph.errors import InputError
 from taichi_sph.openings import load_surface
 from taichi_sph.scene import Scene, read_scene
 from taichi_sph.vessel import Vessel, read_vessel
-from tests.meshes import LENGTH, RADIUS, cylinder
 
 REAL = Path(__file__).parent.parent.parent / "shared" / "vessels"
 AWAY = np.array([120.0, -40.0, 300.0])

@@ -7,12 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-
-from taichi_sph import surface, wall_sampling
-from taichi_sph.errors import InputError
-from taichi_sph.scene import Column, OpeningTable, read_scene
-from taichi_sph.vessel import Vessel, build_vessel, check_vessel, read_vessel
-from tests.meshes import (
+from meshes import (
     BOTTOM,
     LENGTH,
     RADIUS,
@@ -23,6 +18,11 @@ from tests.meshes import (
     tables,
     write_scene,
 )
+
+from taichi_sph import surface, wall_sampling
+from taichi_sph.errors import InputError
+from taichi_sph.scene import Column, OpeningTable, read_scene
+from taichi_sph.vessel import Vessel, build_vessel, check_vessel, read_vessel
 
 VESSELS = Path(__file__).parent.parent / "assets" / "vessels"
 SCENES = sorted(path.relative_to(VESSELS).as_posix() for path in VESSELS.glob("*/scene.toml"))
