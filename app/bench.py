@@ -256,14 +256,14 @@ def measure_peer(threads: int | None) -> list[Row]:
 
 
 def measure_start(scene: str, arch: str) -> tuple[float, float]:
-    """Wall seconds of `vesselflow run SCENE --frames 1`, without and with a kernel cache."""
+    """Wall seconds of a run to its first step, without and with what a first run has cached."""
     with tempfile.TemporaryDirectory() as cache:
         environment = dict(os.environ, TI_OFFLINE_CACHE_FILE_PATH=cache, XDG_CACHE_HOME=cache)
         times = []
         for _ in range(2):
             before = time.perf_counter()
             subprocess.run(
-                [sys.executable, "-m", "app", "run", scene, "--frames", "1", "--arch", arch],
+                [sys.executable, "-m", "app", "run", scene, "--until", "1e-6", "--arch", arch],
                 check=True,
                 env=environment,
                 stdout=subprocess.DEVNULL,
@@ -312,7 +312,7 @@ def main(
 
     if peer and not has_peer():
         raise InputError("--peer: pysplishsplash is not installed; pip install 'vesselflow[peer]'")
-    console = Console()
+    console = Console() if sys.stdout.isatty() else Console(width=120)
     machine = _machine(arch, threads)
     console.print(", ".join(f"{key} {value}" for key, value in machine.items()))
     rows: list[Row] = []
@@ -323,7 +323,13 @@ def main(
         ours, theirs = _in_own_process(measure_peer, threads)
         rows += [ours, theirs]
         ratio = ours.microseconds_per_particle_step / theirs.microseconds_per_particle_step
-        notes.append(f"a particle-step costs {ratio:.2f} of the peer's")
+        notes.append(f"a particle-step of the column costs {ratio:.2f} of the peer's")
+        notes += [
+            f"a particle-step of {row.case} costs "
+            f"{row.microseconds_per_particle_step / theirs.microseconds_per_particle_step:.2f} "
+            "of the peer's"
+            for row in rows[: len(scenes)]
+        ]
     if scale:
         sizes = [_in_own_process(measure_column, *s, arch, threads) for s in COLUMNS]
         rows += sizes
@@ -338,9 +344,8 @@ def main(
         for path in scenes:
             starts[str(path)] = measure_start(str(path), arch)
             cold, warm = starts[str(path)]
-            notes.append(
-                f"{path.parent.name}/{path.stem} to frame 1: {cold:.1f} s cold, {warm:.1f} s warm"
-            )
+            name = read_scene(path).name
+            notes.append(f"{name} to the first step: {cold:.1f} s cold, {warm:.1f} s warm")
     table = Table(title="cost of a step, neighbour search included")
     for heading in (
         "case",

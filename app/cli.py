@@ -26,7 +26,7 @@ arch_option = click.option(
     type=click.Choice(["cpu", "gpu"]),
     default="cpu",
     show_default=True,
-    help="Where to compute; gpu is the first of CUDA, Vulkan and Metal that works.",
+    help="Where to compute; gpu is CUDA or Metal (untested).",
 )
 threads_option = click.option(
     "--threads", type=click.IntRange(min=1), help="CPU threads.  [default: all]"
@@ -204,6 +204,69 @@ def summary_text(summary: "Summary") -> str:
         f"  compression {1e2 * s.compression_p99:.2f} % (99th percentile; "
         f"most {1e2 * s.most_compression_p99:.2f} %), kinetic energy {s.kinetic_energy:.3g} J"
     )
+
+
+class Heights(click.ParamType):
+    """Column heights: numbers between commas."""
+
+    name = "heights"
+
+    def convert(
+        self, value: str, param: click.Parameter | None, context: click.Context | None
+    ) -> list[float]:
+        """Parse the text."""
+        try:
+            heights = [float(part) for part in value.split(",")]
+        except ValueError:
+            self.fail(f"{value!r}: give numbers between commas, as 0.01,0.02", param, context)
+        if not all(0.0 < h < float("inf") for h in heights):
+            self.fail(f"{value!r}: heights are positive numbers [m]", param, context)
+        return heights
+
+
+@cli.command()
+@click.argument("scene_name", metavar="SCENE")
+@click.option(
+    "--heights", type=Heights(), required=True, help="Column heights [m], comma-separated."
+)
+@click.option("--frames", type=click.IntRange(min=1), default=800, show_default=True)
+@click.option("--out", type=output_path, required=True, metavar="FILE", help="HDF5 dataset.")
+@click.option(
+    "--substeps",
+    type=click.IntRange(min=1),
+    default=4,
+    show_default=True,
+    help="Steps of the physics in a frame.",
+)
+@click.option("--features", is_flag=True, help="Store the features and targets too.")
+@click.option("--processes", type=click.IntRange(min=1), default=1, show_default=True)
+@click.option("--scheduler", metavar="dask:ADDRESS", help="Record on a Dask cluster.")
+@arch_option
+@threads_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def record(
+    scene_name: str,
+    heights: list[float],
+    frames: int,
+    out: Path,
+    substeps: int,
+    features: bool,
+    processes: int,
+    scheduler: str | None,
+    arch: str,
+    threads: int | None,
+    seed: int,
+) -> int:
+    """Record the physics for training: a run for each column height, resumed if cut short."""
+    from app.record import record as record_runs
+    from app.scenes import scene_path
+
+    recording = record_runs(
+        scene_path(scene_name), heights, frames, out, substeps, features, processes,
+        arch, threads, seed, scheduler,
+    )  # fmt: skip
+    click.echo(str(recording))
+    return 0
 
 
 @cli.command()

@@ -1,1 +1,1 @@
-"""The learned acceleration (to come): it may import taichi_sph, never app."""
+"""The learned acceleration; it may import taichi_sph, never app."""

@@ -20,11 +20,11 @@
 
 T is the frame interval, R the support radius, N_0 the neighbours of a lattice and U the speed that
 the bins of v_ij span.  The six bins of a distance span [0, R] as printed, l_b = b R/6.  The paper
-does not say what those of a speed span; here U = R/T, the relative speed at which a neighbour
-crosses the neighbourhood within one frame: beyond it (the last bin takes what is faster) positions
-one frame apart have nothing to say to each other.  Skewness and kurtosis do not depend on the
-scale of l_b, so power sums of the bin numbers replace the histogram: they are exact in single
-precision.
+does not say what those of a speed span.  Here [0, U] with U a fortieth of the sound speed, a
+quarter of the largest speed that the scene's drop allows: neighbours share most of their motion,
+and a wider span would leave all of them in the first bin.  The last bin takes what is faster.
+Skewness and kurtosis do not depend on the scale of l_b, so power sums of the bin numbers replace
+the histogram: they are exact in single precision.
 """
 
 import math
@@ -32,11 +32,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from taichi_sph.neighbors import Neighbors
-from taichi_sph.particles import Particles
-from taichi_sph.wall import Wall
-
 COUNT = 23
+EXTENDED = 25
+"""With two more, for density is not among the paper's: 50 max(rho/rho_0 - 1, 0) and T div v."""
 BINS = 6
 TABLE_VERSION = 1
 """Raised when a definition above changes; weights of another version are refused."""
@@ -45,6 +43,7 @@ NAMES = (
     "a_x", "a_y", "a_z", "N", "disx_b", "disy_b", "disz_b", "rvx_b", "rvy_b", "rvz_b",
     "D_dis_b", "D_rv_b", "alpha_dis_b", "alpha_rv_b", "beta_dis_b", "beta_rv_b",
     "M", "disx_p", "disy_p", "disz_p", "D_dis_p", "alpha_dis_p", "beta_dis_p",
+    "compression", "divergence",
 )  # fmt: skip
 
 
@@ -59,10 +58,17 @@ class FeatureScales:
     """d [m]."""
     frame_interval: float
     """T [s]."""
+    sound_speed: float
+    """c [m/s]."""
 
     @property
     def speed(self) -> float:
-        """U = R/T [m/s]."""
+        """U = c/40 [m/s]."""
+        return self.sound_speed / 40.0
+
+    @property
+    def speed_limit(self) -> float:
+        """R/T [m/s]: a neighbourhood crossed in one frame."""
         return self.support_radius / self.frame_interval
 
     @property
@@ -82,12 +88,18 @@ def central_moments(n, s1, s2, s3, s4):
     skewness = 0.0
     kurtosis = 0.0
     if n > 0.0:
-        mean = s1 / n
-        variance = s2 / n - mean * mean
+        # About the bin nearest to the mean first: exact, since all are small multiples of 1/16.
+        b = ti.round(s1 / n + 0.5) - 0.5
+        t1 = s1 - n * b
+        t2 = s2 - b * (2.0 * s1 - n * b)
+        t3 = s3 - b * (3.0 * s2 - b * (3.0 * s1 - n * b))
+        t4 = s4 - b * (4.0 * s3 - b * (6.0 * s2 - b * (4.0 * s1 - n * b)))
+        mean = t1 / n
+        variance = t2 / n - mean * mean
         # Bins are whole numbers: the least variance that is not zero is about 1/n.
         if variance * n > 0.5 * (1.0 - 1.0 / n):
-            third = s3 / n - 3.0 * mean * s2 / n + 2.0 * mean**3
-            fourth = s4 / n - 4.0 * mean * s3 / n + 6.0 * mean * mean * s2 / n - 3.0 * mean**4
+            third = t3 / n - 3.0 * mean * t2 / n + 2.0 * mean**3
+            fourth = t4 / n - 4.0 * mean * t3 / n + 6.0 * mean * mean * t2 / n - 3.0 * mean**4
             skewness = third / (variance * ti.sqrt(variance))
             kurtosis = fourth / (variance * variance)
     return ti.Vector([skewness, kurtosis])
@@ -102,12 +114,20 @@ def bin_of(q):
 
 
 @ti.func
-def features_of(i, p: ti.template(), w: ti.template(), nb: ti.template(), scales: ti.template()):
-    """The 23 features of particle i, dimensionless (last column of the table).
+def features_of(
+    i,
+    p: ti.template(),
+    w: ti.template(),
+    nb: ti.template(),
+    fluid: ti.template(),
+    scales: ti.template(),
+):
+    """The 23 features of particle i, dimensionless (last column of the table), and three more.
 
-    Reads: position, velocity, acceleration.
+    The three are 50 max(rho/rho_0 - 1, 0) by Eq. 2, T div v (the rate at which that density falls)
+    and rho/rho_0 itself, which no network sees.  Reads: position, velocity, acceleration.
     """
-    f = ti.Vector([0.0] * 23)
+    f = ti.Vector([0.0] * 26)
     x_i = p.position[i]
     v_i = p.velocity[i]
     a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
@@ -116,6 +136,8 @@ def features_of(i, p: ti.template(), w: ti.template(), nb: ti.template(), scales
     per_length = ti.static(1.0 / scales.support_radius)
     per_speed = ti.static(1.0 / scales.speed)
 
+    blood = fluid.kernel.w(0.0)
+    blood_rate = 0.0
     n = 0.0
     r_sum = ti.Vector([0.0, 0.0, 0.0])
     v_sum = ti.Vector([0.0, 0.0, 0.0])
@@ -138,6 +160,9 @@ def features_of(i, p: ti.template(), w: ti.template(), nb: ti.template(), scales
             speed += ti.Vector([u, u * u])
             b = bin_of(q)
             distance_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
+            r = q * ti.static(scales.support_radius)
+            blood += fluid.kernel.w(r)
+            blood_rate += fluid.kernel.slope(r) * v_ji.dot(r_ji)
             c = bin_of(u)
             speed_bins += ti.Vector([c, c * c, c * c * c, c * c * c * c])
     if n > 0.0:
@@ -156,12 +181,15 @@ def features_of(i, p: ti.template(), w: ti.template(), nb: ti.template(), scales
         f[13] = shape2[0]
         f[15] = shape2[1]
 
+    behind = 0.0
+    behind_rate = 0.0
     m = 0.0
     wall_sum = ti.Vector([0.0, 0.0, 0.0])
     wall_distance = ti.Vector([0.0, 0.0])
     wall_bins = ti.Vector([0.0, 0.0, 0.0, 0.0])
     for k in range(nb.wall_count[i]):
-        r_ki = -nb.grid.separation(x_i, w.position[nb.wall_index[i, k]]) * per_length
+        kk = nb.wall_index[i, k]
+        r_ki = -nb.grid.separation(x_i, w.position[kk]) * per_length
         q = r_ki.norm()
         if q < 1.0:
             m += 1.0
@@ -169,6 +197,9 @@ def features_of(i, p: ti.template(), w: ti.template(), nb: ti.template(), scales
             wall_distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
             b = bin_of(q)
             wall_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
+            r = q * ti.static(scales.support_radius)
+            behind += w.volume[kk] * fluid.kernel.w(r)
+            behind_rate -= w.volume[kk] * fluid.kernel.slope(r) * v_i.dot(r_ki)
     if m > 0.0:
         f[16] = m * ti.static(1.0 / scales.neighbours)
         for a in ti.static(range(3)):
@@ -178,6 +209,13 @@ def features_of(i, p: ti.template(), w: ti.template(), nb: ti.template(), scales
         shape3 = central_moments(m, s3[0], s3[1], s3[2], s3[3])
         f[21] = shape3[0]
         f[22] = shape3[1]
+    # d(rho_i)/dt = sum_j m slope r_ij.v_ij, and r_ij.v_ij = r_ji.v_ji.
+    share = ti.static(fluid.calibration.mass / fluid.state.rest_density)
+    gamma = ti.static(fluid.calibration.wall_density)
+    f[25] = share * blood + gamma * behind
+    f[23] = 50.0 * ti.max(0.0, f[25] - 1.0)
+    rate = share * blood_rate * ti.static(scales.speed) + gamma * behind_rate
+    f[24] = -rate * ti.static(scales.support_radius * scales.frame_interval)
     return f
 
 
@@ -186,14 +224,12 @@ def extract(
     p: ti.template(),
     w: ti.template(),
     nb: ti.template(),
+    fluid: ti.template(),
     scales: ti.template(),
     out: ti.types.ndarray(dtype=float, ndim=2),
 ):
-    """Features of every live particle, by identity.  Writes: out[identity, 23]."""
+    """Features and rho/rho_0 of every live particle.  Writes: out[identity, 26]."""
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, scales)
-        for k in ti.static(range(23)):
+        f = features_of(i, p, w, nb, fluid, scales)
+        for k in ti.static(range(26)):
             out[p.identity[i], k] = f[k]
-
-
-__all__ = ["COUNT", "NAMES", "FeatureScales", "Neighbors", "Particles", "Wall", "extract"]

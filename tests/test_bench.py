@@ -1,0 +1,35 @@
+import json
+
+import pytest
+
+from app import bench
+from taichi_sph.errors import InputError
+
+
+def test_a_row_holds_the_quartiles_and_the_cost_of_a_particle():
+    row = bench._row("case", 1000, 10, [4e-3, 1e-3, 2e-3, 3e-3, 5e-3], 1e-5)
+    assert (row.step_ms_low, row.step_ms, row.step_ms_high) == pytest.approx((2.0, 3.0, 4.0))
+    assert row.microseconds_per_particle_step == pytest.approx(3.0)
+    assert row.real_time_factor == pytest.approx(1e-5 / 3e-3)
+
+
+def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for():
+    row = bench._in_own_process(bench.measure_column, 6, 8, "cpu", 1)
+    assert row.blood_particles == 6 * 6 * 8
+    assert row.proxy_particles == pytest.approx(4 * 6 * 18 + 36, rel=0.02)  # five walls, s = d
+    assert row.step_ms > 0.0
+    assert row.memory_mib > 50.0
+
+
+def test_a_peer_that_is_not_installed_is_one_sentence(monkeypatch):
+    monkeypatch.setattr(bench, "has_peer", lambda: False)
+    with pytest.raises(InputError, match=r"^--peer: pysplishsplash is not installed"):
+        bench.main([], peer=True)
+
+
+def test_figures_go_to_json(tmp_path):
+    out = tmp_path / "bench.json"
+    assert bench.main([], json_file=out) == 0
+    result = json.loads(out.read_text())
+    assert result["rows"] == []
+    assert result["machine"]["precision"] == "f32"

@@ -1,0 +1,137 @@
+"""The 23 features against numpy histograms, and the network against torch's twin in numpy."""
+
+import numpy as np
+import pytest
+from builders import DENSITY, SPHERE, D, R, Stage, ball, make_fluid, number, precision, sphere
+from taichi import ndarray
+
+from nn.features import BINS, COUNT, EXTENDED, NAMES, FeatureScales, extract
+
+SCALES = FeatureScales(R, D, 4e-4, 2.0)
+FLUID = make_fluid()
+CLOSE = {"f64": 1e-10, "f32": 1e-5}
+"""Of each feature's largest value; single precision has seven digits."""
+EDGE = 1e-5
+"""Values this near to the edge of a bin may fall on its other side when rounded."""
+
+
+def shape(values: np.ndarray) -> tuple[float, float]:
+    """Skewness and kurtosis of the frequencies of six bins, Eqs. 23 and 24."""
+    frequency, _ = np.histogram(np.minimum(values, 1.0 - 1e-12), bins=BINS, range=(0.0, 1.0))
+    if np.count_nonzero(frequency) < 2:
+        return 0.0, 0.0
+    l = np.arange(1, BINS + 1) / BINS
+    n = frequency.sum()
+    deviation = l - (l * frequency).sum() / n
+    sigma = np.sqrt((deviation**2 * frequency).sum() / n)
+    return (
+        (deviation**3 * frequency).sum() / (sigma**3 * n),
+        (deviation**4 * frequency).sum() / (sigma**4 * n),
+    )
+
+
+def features_of(x, v, a, y) -> tuple[np.ndarray, np.ndarray]:
+    """Features by brute force, (n, 23), and whether rounding could change a bin, (n,)."""
+    rows, doubtful = np.zeros((len(x), COUNT)), np.zeros(len(x), bool)
+    for i in range(len(x)):
+        f = rows[i]
+        f[0:3] = a[i] / SCALES.acceleration
+        r, u = (x - x[i]) / R, (v - v[i]) / SCALES.speed
+        q = np.linalg.norm(r, axis=1)
+        near = (q < 1.0) & (np.arange(len(x)) != i)
+        r, u, q = r[near], u[near], q[near]
+        s = np.linalg.norm(u, axis=1)
+        edges = [q, s]
+        if len(q):
+            f[3] = len(q) / SCALES.neighbours
+            f[4:7], f[7:10] = r.mean(axis=0), u.mean(axis=0)
+            f[10], f[11] = q.var(), s.var()
+            (f[12], f[14]), (f[13], f[15]) = shape(q), shape(s)
+        r = (y - x[i]) / R
+        q = np.linalg.norm(r, axis=1)
+        r, q = r[q < 1.0], q[q < 1.0]
+        edges.append(q)
+        if len(q):
+            f[16] = len(q) / SCALES.neighbours
+            f[17:20], f[20] = r.mean(axis=0), q.var()
+            f[21], f[22] = shape(q)
+        values = np.concatenate(edges) * BINS
+        doubtful[i] = len(values) > 0 and np.abs(values - np.rint(values)).min() < EDGE
+    return rows, doubtful
+
+
+def cloud(seed: int) -> Stage:
+    """Blood in the round vessel, up to its wall, with a few lone drops knocked out of it."""
+    generator = np.random.default_rng(seed)
+    x = ball(generator, SPHERE - 0.2 * D)
+    x = x[generator.random(len(x)) < np.where(x[:, 2] > 0.0, 0.15, 1.0)]
+    stage = sphere()
+    v = 0.02 * generator.normal(size=x.shape) + np.roll(20.0 * x, 1, axis=1)
+    stage.put(x, v)
+    a = np.zeros((stage.particles.capacity, 3), number())
+    a[: len(x)] = 50.0 * generator.normal(size=x.shape)
+    stage.particles.acceleration.from_numpy(a)
+    stage.build()
+    return stage
+
+
+def extracted(stage: Stage) -> np.ndarray:
+    """What the kernel finds, by identity, (n, 26)."""
+    out = ndarray(float, (stage.particles.capacity, EXTENDED + 1))
+    extract(stage.particles, stage.wall, stage.neighbors, FLUID, SCALES, out)
+    return out.to_numpy()[: stage.particles.count[None]]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_features_are_the_papers_statistics(seed):
+    stage = cloud(seed)
+    particles = stage.particles
+    x, v, a = map(stage.in_order, (particles.position, particles.velocity, particles.acceleration))
+    y = stage.wall.position.to_numpy()[: stage.wall.count].astype(float)
+    expected, doubtful = features_of(x, v, a, y)
+    found = extracted(stage)[:, :COUNT]
+    assert doubtful.mean() < 0.2
+    for k, name in enumerate(NAMES[:COUNT]):
+        largest = np.abs(expected[:, k]).max()
+        assert largest > 0.0, name
+        difference = np.abs(found[:, k] - expected[:, k])[~doubtful].max()
+        assert difference < CLOSE[precision()] * largest, name
+
+
+def test_density_beside_the_features_is_equation_2():
+    stage = cloud(2)
+    density = stage.reference(FLUID).rho / DENSITY
+    found = extracted(stage)
+    np.testing.assert_allclose(found[:, EXTENDED], density, rtol=CLOSE[precision()])
+    np.testing.assert_allclose(
+        found[:, COUNT], 50.0 * np.maximum(density - 1.0, 0.0), atol=5e3 * CLOSE[precision()]
+    )
+
+
+def test_divergence_is_the_rate_at_which_density_falls():
+    stage = cloud(3)
+    particles = stage.particles
+    x, v = map(stage.in_order, (particles.position, particles.velocity))
+    a = stage.in_order(particles.acceleration)
+    before = extracted(stage)
+    dt = 1e-6
+    densities = []
+    for sign in (1.0, -1.0):
+        stage.put(x + sign * dt * v, v)
+        stage.build()
+        densities.append(stage.reference(FLUID).rho / DENSITY)
+    rate = (densities[0] - densities[1]) / (2.0 * dt)
+    assert np.abs(a).max() > 0.0
+    scale = np.abs(rate).max()
+    error = np.abs(before[:, COUNT + 1] / SCALES.frame_interval + rate).max()
+    # The difference's own rounding in f32: 1e-7 over 2e-6 s.
+    assert error < {"f64": 1e-4 * scale, "f32": 0.2 + 1e-2 * scale}[precision()]
+
+
+def test_a_lone_particle_has_finite_features_and_no_neighbours():
+    stage = sphere()
+    stage.put(np.zeros((1, 3)))
+    stage.build()
+    found = extracted(stage)[0]
+    assert np.isfinite(found).all()
+    assert np.all(found[:COUNT] == 0.0)
