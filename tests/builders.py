@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
-from reference import Blood
 
+from reference import Blood
 from taichi_sph.acceleration import Fluid, SphAcceleration
 from taichi_sph.calibration import Calibration, calibrate
 from taichi_sph.equation_of_state import Tait

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+
 from builders import (
     DENSITY,
     KERNEL,
@@ -23,7 +24,6 @@ from builders import (
     sphere,
 )
 from reference import Blood
-
 from taichi_sph.acceleration import SphAcceleration
 from taichi_sph.rheology import Casson, Newtonian
 

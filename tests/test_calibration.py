@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import taichi as ti
+
 from builders import (
     BOX,
     DENSITY,
@@ -24,7 +25,6 @@ from builders import (
     precision,
 )
 from reference import proxy_volumes, separations, wendland, wendland_gradient
-
 from taichi_sph.calibration import calibrate, softening
 from taichi_sph.rheology import Newtonian
 from taichi_sph.smoothing_kernels import WendlandC2

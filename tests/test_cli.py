@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_simulation import FakeSimulation
-from recordings import environment, positions, verify
 
 from app.cli import invoke
 from app.scenes import shipped
+from fake_simulation import FakeSimulation
+from recordings import environment, positions, verify
 
 PATIENCE = 180.0
 """Longest that a busy machine may take for a run of a few seconds [s]."""

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_simulation import FakeSimulation
 from rich.console import Console
 
 from app.drive import drive, frame_time
 from app.output import check_output, write_json
 from app.progress import Progress, duration
+from fake_simulation import FakeSimulation
 from taichi_sph.errors import InputError
 
 

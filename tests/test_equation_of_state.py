@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 import taichi as ti
-from builders import DENSITY, number, precision
 
+from builders import DENSITY, number, precision
 from taichi_sph.equation_of_state import Tait
 
 C = 3.0

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from builders import DENSITY, SPHERE, D, R, Stage, ball, make_fluid, number, precision, sphere
 from taichi import ndarray
 
+from builders import DENSITY, SPHERE, D, R, Stage, ball, make_fluid, number, precision, sphere
 from nn.features import BINS, COUNT, EXTENDED, NAMES, FeatureScales, extract
 
 SCALES = FeatureScales(R, D, 4e-4, 2.0)

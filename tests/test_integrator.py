@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from builders import (
     CAPACITY,
     SEPTUM,
@@ -14,7 +15,6 @@ from builders import (
     precision,
     sphere,
 )
-
 from taichi_sph.integrator import WALL_MARGIN, kick_drift, survey
 from taichi_sph.motion import Motion
 

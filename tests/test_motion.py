@@ -2,6 +2,7 @@ import re
 
 import numpy as np
 import pytest
+
 from builders import (
     SKIN,
     D,
@@ -14,7 +15,6 @@ from builders import (
     plane,
 )
 from reference import separations
-
 from taichi_sph.errors import RunError
 from taichi_sph.motion import Motion
 from taichi_sph.rheology import Casson, Newtonian

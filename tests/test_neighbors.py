@@ -3,6 +3,7 @@ import re
 
 import numpy as np
 import pytest
+
 from builders import (
     BOX,
     CAPACITY,
@@ -19,7 +20,6 @@ from builders import (
     sphere,
 )
 from reference import proxy_volumes, separations
-
 from taichi_sph.errors import RunError
 from taichi_sph.neighbors import list_capacity, make_grid
 from taichi_sph.rheology import Casson

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from meshes import LENGTH, RADIUS, cylinder
 
 from app.new import create_scene
+from meshes import LENGTH, RADIUS, cylinder
 from taichi_sph import surface
 from taichi_sph.errors import InputError
 from taichi_sph.openings import load_surface

@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 import taichi as ti
+
 from builders import number, precision
 from reference import casson
-
 from taichi_sph.rheology import Casson, Newtonian, rheology_of
 from taichi_sph.scene import CassonTable, NewtonianTable
 

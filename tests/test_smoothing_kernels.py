@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import taichi as ti
+
 from builders import KERNEL, R, number, precision
 from reference import wendland, wendland_gradient
-
 from taichi_sph.smoothing_kernels import WendlandC2
 
 INTEGRAL = 1e-12

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+
 from meshes import (
     BOTTOM,
     LENGTH,
@@ -18,7 +19,6 @@ from meshes import (
     tables,
     write_scene,
 )
-
 from taichi_sph import surface, wall_sampling
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Column, OpeningTable, read_scene

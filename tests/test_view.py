@@ -9,17 +9,6 @@ from typing import IO, Any, cast
 
 import numpy as np
 import pytest
-from fake_simulation import FakeSimulation
-from recordings import (
-    Viewer,
-    environment,
-    free_port,
-    positions,
-    rows,
-    scalars,
-    static,
-    verify,
-)
 
 from app import view as view_module
 from app.appearance import (
@@ -34,6 +23,17 @@ from app.appearance import (
 )
 from app.drive import drive
 from app.view import RerunView
+from fake_simulation import FakeSimulation
+from recordings import (
+    Viewer,
+    environment,
+    free_port,
+    positions,
+    rows,
+    scalars,
+    static,
+    verify,
+)
 from taichi_sph.errors import InputError
 
 FAKE = Path(__file__).with_name("fake_simulation.py")
