@@ -116,6 +116,19 @@ def cli() -> None:
     metavar="METRES",
     help="Height of the column [m], instead of the scene's.",
 )
+@click.option(
+    "--model",
+    type=click.Choice(["physics", "pcnet"]),
+    default="physics",
+    show_default=True,
+    help="What computes accelerations; pcnet is the trained network.",
+)
+@click.option(
+    "--weights",
+    type=output_path,
+    metavar="FILE",
+    help="Weights of the network.  [default: pcnet.npz beside the scene]",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 def run(
     scene_name: str,
@@ -130,6 +143,8 @@ def run(
     summary: Path | None,
     particles: int | None,
     height: float | None,
+    model: str,
+    weights: Path | None,
     seed: int,
 ) -> int:
     """Simulate a scene."""
@@ -146,6 +161,8 @@ def run(
         check_output(summary, "--summary", b"{")
     if rrd is None and live is None and every > 1:
         raise InputError("--every: nothing is shown without --rrd or --live")
+    if weights is not None and model != "pcnet":
+        raise InputError("--weights: only --model pcnet has weights")
 
     from app.drive import drive
     from app.progress import Progress
@@ -154,7 +171,12 @@ def run(
 
     with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
         start(arch, precision, threads, random_seed=seed)
-    simulation = Simulation.from_scene(scene, seed=seed)
+    options = {}
+    if model == "pcnet":
+        from nn.pcnet import load_pcnet
+
+        options["make_model"] = load_pcnet(weights or Path(scene.folder) / "pcnet.npz", scene)
+    simulation = Simulation.from_scene(scene, seed=seed, **options)
     view = None
     if rrd is not None or live is not None:
         from app.view import RerunView
@@ -204,6 +226,80 @@ def summary_text(summary: "Summary") -> str:
         f"  compression {1e2 * s.compression_p99:.2f} % (99th percentile; "
         f"most {1e2 * s.most_compression_p99:.2f} %), kinetic energy {s.kinetic_energy:.3g} J"
     )
+
+
+@cli.command()
+@click.argument("data", type=output_path)
+@click.option("--out", type=output_path, required=True, metavar="FILE", help="Weights (.npz).")
+@click.option(
+    "--head",
+    type=click.Choice(["pressure", "direct"]),
+    default="pressure",
+    show_default=True,
+    help="What the network gives: a pressure and a viscosity, or the acceleration (the paper's).",
+)
+@click.option(
+    "--correction",
+    type=click.Choice(["bp", "periodic", "relabel"]),
+    default="relabel",
+    show_default=True,
+    help="How errors are corrected in training; periodic is the paper's.",
+)
+@click.option(
+    "--hold-out",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Run of the data that chooses the weights and is not trained on.",
+)
+@click.option("--iterations", type=click.IntRange(min=1), default=1600, show_default=True)
+@click.option(
+    "--minutes",
+    type=click.FloatRange(min=0, min_open=True),
+    default=20.0,
+    show_default=True,
+    help="Stop after so much wall time.",
+)
+@arch_option
+@threads_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def train(
+    data: Path,
+    out: Path,
+    head: str,
+    correction: str,
+    hold_out: int,
+    iterations: int,
+    minutes: float,
+    arch: str,
+    threads: int | None,
+    seed: int,
+) -> int:
+    """Train PcNet on recorded runs; the best rollout on the held-out run is kept."""
+    import importlib.util
+
+    from app.output import check_output
+
+    if importlib.util.find_spec("torch") is None:
+        raise InputError("train: torch is not installed; pip install 'vesselflow[train]'")
+    check_output(out, "--out", b"PK")
+
+    from nn.train import Settings, train_weights
+    from taichi_sph.runtime import start
+
+    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
+        start(arch, "f32", threads, random_seed=seed)
+    settings = Settings(
+        head=head, correction=correction, iterations=iterations, minutes=minutes, seed=seed
+    )
+    command = f"vesselflow train {data.name} --head {head} --correction {correction}"
+    command += f" --hold-out {hold_out} --iterations {iterations} --seed {seed}"
+    weights = train_weights(
+        data, out, settings, hold_out, command, report=lambda line: click.echo(line, err=True)
+    )
+    figures = ", ".join(f"{k} {v:.3f}" for k, v in weights.training.validation.items())
+    click.echo(f"{out}: {figures}")
+    return 0
 
 
 class Heights(click.ParamType):

@@ -129,11 +129,6 @@ def frame_time(frame: int, frame_interval: float, until: float) -> float:
     return until if time > until - 5e-7 * frame_interval else time
 
 
-def model_name(model: object) -> str:
-    """What the summary calls the accelerations' source: sph, pcnet."""
-    return type(model).__name__.removesuffix("Acceleration").lower()
-
-
 def drive(
     simulation: "Simulation",
     observers: Sequence[Observer],
@@ -208,7 +203,7 @@ def drive(
     wall_time = time.perf_counter() - began
     summary = Summary(
         scene=scene.name,
-        model=model_name(simulation.model),
+        model=simulation.model.name,
         blood_particles=derived.blood_particles,
         proxy_particles=derived.proxy_particles,
         steps=steps,

@@ -22,6 +22,8 @@ from taichi_sph.vessel import read_vessel
 class SphAcceleration:
     """Stands for a model; its name is what matters."""
 
+    name = "physics"
+
 
 class FakeSimulation:
     """Particles that fall at different, constant speeds."""

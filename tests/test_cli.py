@@ -87,7 +87,7 @@ def test_a_run_from_another_folder_leaves_a_recording_and_a_summary(
     assert "Taichi" not in done.stdout + done.stderr
     told = json.loads(summary.read_text())
     assert told["scene"] == tmp_path.name
-    assert told["model"] == "sph"
+    assert told["model"] == "physics"
     assert told["frames"] == 3
     assert told["simulated_time"] == pytest.approx(0.006)
     assert told["blood_particles"] > 500

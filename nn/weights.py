@@ -1,0 +1,160 @@
+"""Weights: raw arrays and what they were made for, in one `.npz`; needs no torch."""
+
+import json
+import os
+import zipfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nn.features import TABLE_VERSION
+from taichi_sph.errors import InputError
+
+HEADS = ("direct", "pressure")
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Training:
+    """What the network was trained on; `run` refuses a scene that differs."""
+
+    head: str
+    """"direct": the acceleration itself, as the paper; "pressure": see nn.pcnet."""
+    spacing: float
+    """d [m]."""
+    support_radius: float
+    """R [m]."""
+    frame_interval: float
+    """T, the step of the network [s]."""
+    substeps: int
+    """M: steps of the physics in T."""
+    sound_speed: float
+    """c of the physics that made the data [m/s]."""
+    wall_spacing_ratio: float
+    correction: str
+    """"bp", "periodic" or "relabel"."""
+    seed: int
+    scene: str
+    """Name of the training scene."""
+    scene_hash: str
+    """SHA-256 of the training scene's text."""
+    table_version: int = TABLE_VERSION
+    validation: dict[str, float] = field(default_factory=dict)
+    """Figures of the rollout on the held-out height."""
+    command: str = ""
+    """What made the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """A multilayer perceptron with tanh between its layers."""
+
+    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """(weight (out, in), bias (out,)) of each layer, f32."""
+    mean: np.ndarray
+    """Subtracted from the inputs, (in,)."""
+    deviation: np.ndarray
+    """Divides them, (in,); never zero."""
+    scale: np.ndarray
+    """Multiplies the outputs, (out,)."""
+    training: Training
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Width of the input, of each hidden layer and of the output."""
+        return (self.layers[0][0].shape[1], *(w.shape[0] for w, _ in self.layers))
+
+    def evaluate(self, x: np.ndarray) -> np.ndarray:
+        """The network in numpy: (n, in) dimensionless features -> (n, out)."""
+        y = np.clip((x - self.mean) / self.deviation, -CLIP, CLIP)
+        for k, (w, b) in enumerate(self.layers):
+            y = y @ w.T + b
+            if k + 1 < len(self.layers):
+                y = np.tanh(y)
+        return y * self.scale
+
+    def save(self, path: Path) -> None:
+        """Write the file, atomically."""
+        arrays: dict[str, Any] = {
+            "mean": self.mean,
+            "deviation": self.deviation,
+            "scale": self.scale,
+            "schema": np.int64(SCHEMA),
+            "training": np.str_(json.dumps(asdict(self.training))),
+        }
+        for k, (w, b) in enumerate(self.layers):
+            arrays[f"weight_{k}"], arrays[f"bias_{k}"] = w, b
+        temporary = path.with_name(path.name + ".part")
+        with temporary.open("wb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> "Weights":
+        """Read the file.
+
+        Raises:
+            InputError: no such file, cut, or not weights of this version.
+        """
+        try:
+            # Numpy leaves a file that it cannot read open; what is open here is closed here.
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                if int(file["schema"]) != SCHEMA:
+                    raise InputError(
+                        f"{path}: weights of schema {int(file['schema'])}, this program reads "
+                        f"{SCHEMA}; train them again"
+                    )
+                training = Training(**json.loads(str(file["training"])))
+                count = sum(name.startswith("weight_") for name in file.files)
+                layers = tuple(
+                    (file[f"weight_{k}"].astype(np.float32), file[f"bias_{k}"].astype(np.float32))
+                    for k in range(count)
+                )
+                return cls(layers, file["mean"], file["deviation"], file["scale"], training)
+        except InputError:
+            raise
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot read the weights: {error.strerror or error}"
+            ) from None
+        except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError) as error:
+            raise InputError(
+                f"{path}: not a weights file of vesselflow, or a cut one ({error})"
+            ) from None
+
+
+CLIP = 5.0
+"""Standardised inputs are held within this many deviations."""
+
+
+def require_fit(weights: Weights, path: str, found: dict[str, float]) -> None:
+    """Refuse weights that were trained for other numbers than the scene's.
+
+    Args:
+        weights: the weights.
+        path: their file, for the message.
+        found: the scene's value of each field of `Training` to compare.
+
+    Raises:
+        InputError: names the field and both values.
+    """
+    if weights.training.table_version != TABLE_VERSION:
+        raise InputError(
+            f"{path}: table_version is {weights.training.table_version} in the weights, "
+            f"{TABLE_VERSION} in this program; train them again"
+        )
+    for name, value in found.items():
+        trained = getattr(weights.training, name)
+        if abs(trained - value) > TOLERANCE * abs(trained):
+            raise InputError(
+                f"{path}: {name} is {trained:.6g} in the weights, {value:.6g} in the scene; "
+                "train on this scene, or give it the weights' value"
+            )
+
+
+TOLERANCE = 1e-3
+"""Relative; numbers pass through text."""
