@@ -94,14 +94,13 @@ def central_moments(n, s1, s2, s3, s4):
         t2 = s2 - b * (2.0 * s1 - n * b)
         t3 = s3 - b * (3.0 * s2 - b * (3.0 * s1 - n * b))
         t4 = s4 - b * (4.0 * s3 - b * (6.0 * s2 - b * (4.0 * s1 - n * b)))
-        mean = t1 / n
-        variance = t2 / n - mean * mean
-        # Bins are whole numbers: the least variance that is not zero is about 1/n.
-        if variance * n > 0.5 * (1.0 - 1.0 / n):
-            third = t3 / n - 3.0 * mean * t2 / n + 2.0 * mean**3
-            fourth = t4 / n - 4.0 * mean * t3 / n + 6.0 * mean * mean * t2 / n - 3.0 * mean**4
-            skewness = third / (variance * ti.sqrt(variance))
-            kurtosis = fourth / (variance * variance)
+        # n^2, n^3 and n^4 times the central moments: whole multiples still, nearly all exact.
+        second = n * t2 - t1 * t1
+        if second > 0.25:
+            third = n * (n * t3 - 3.0 * t1 * t2) + 2.0 * t1 * t1 * t1
+            fourth = n * (n * (n * t4 - 4.0 * t1 * t3) + 6.0 * t1 * t1 * t2) - 3.0 * t1**4
+            skewness = third / (second * ti.sqrt(second))
+            kurtosis = fourth / (second * second)
     return ti.Vector([skewness, kurtosis])
 
 
