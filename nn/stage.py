@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 
 from nn.dataset import State, Substeps
-from nn.features import COUNT, EXTENDED, FeatureScales, extract
+from nn.features import EXTENDED, FeatureScales, extract
 from taichi_sph.acceleration import Fluid, SphAcceleration
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
@@ -98,6 +98,3 @@ class Stage(Simulation):
         self._features.fill(0.0)
         extract(self.particles, self.wall, self.neighbors, self.fluid, scales, self._features)
         return self._features.to_numpy()
-
-
-__all__ = ["COUNT", "Stage"]
