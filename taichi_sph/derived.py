@@ -19,7 +19,7 @@ class Derived:
     support_radius: float
     """R [m]."""
     expected_speed: float
-    """Speed of a free fall from the column's top to the lowest point of the lumen [m/s]."""
+    """Speed of a free fall through the whole lumen, along gravity [m/s]."""
     sound_speed: float
     """c [m/s]: the scene's ratio times the expected speed."""
     step: float
@@ -31,7 +31,7 @@ class Derived:
 
 
 def expected_speed(scene: Scene, vessel: Vessel) -> float:
-    """sqrt(2 g H), H the drop from the top of the column to the lowest point [m/s]."""
+    """sqrt(2 g H), H the extent of the lumen along gravity [m/s]."""
     gravity = np.asarray(scene.gravity)
     g = float(np.linalg.norm(gravity))
     if g == 0.0:

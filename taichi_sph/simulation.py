@@ -23,7 +23,8 @@ ModelMaker = Callable[[Fluid, int], AccelerationModel]
 """Makes a model for a fluid and a number of particles."""
 
 SKIN = 0.2
-"""Skin of the neighbour lists over the support radius; the fastest of 0.1-0.4 on scene A."""
+"""Skin of the neighbour lists over the support radius: a wider one is built less often and holds
+more candidates.  Other values have not been timed."""
 
 OPENING_REACH = 2.5
 """Blood beyond an opening's plane has left by it within this many radii of its centre."""
