@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from app.output import write_json
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene, parse_scene, read_scene
 
@@ -374,9 +375,7 @@ def main(
         console.print(note)
     if json_file:
         result = {"machine": machine, "rows": [asdict(r) for r in rows], "starts": starts}
-        temporary = json_file.with_suffix(".part")
-        temporary.write_text(json.dumps(result, indent=1))
-        temporary.replace(json_file)
+        write_json(json_file, result)
     return 0
 
 

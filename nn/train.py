@@ -210,7 +210,7 @@ def rollout(stage: Stage, model: object, run: Run, frames: int | None = None) ->
     """Roll a model out from the first frame of a recorded run and compare.
 
     Returns: survived (fraction of frames before it died: diverged or 99th percentile of
-    compression over 30 %), path_error (mean distance of the centres of mass over the recorded
+    compression over 30 %), path_error (largest distance of the centres of mass over the recorded
     path's length), drained_error (largest difference of the drained fraction), compression_p99.
     """
     interval = run.facts.frame_interval
