@@ -127,7 +127,7 @@ def cli() -> None:
     "--weights",
     type=output_path,
     metavar="FILE",
-    help="Weights of the network.  [default: pcnet.npz beside the scene]",
+    help="Weights of the network.  [default: pcnet.npz beside the scene, or the aorta's]",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 def run(
@@ -173,9 +173,10 @@ def run(
         start(arch, precision, threads, random_seed=seed)
     options = {}
     if model == "pcnet":
+        from app.scenes import weights_for
         from nn.pcnet import load_pcnet
 
-        options["make_model"] = load_pcnet(weights or Path(scene.folder) / "pcnet.npz", scene)
+        options["make_model"] = load_pcnet(weights or weights_for(scene), scene)
     simulation = Simulation.from_scene(scene, seed=seed, **options)
     view = None
     if rrd is not None or live is not None:
@@ -225,6 +226,11 @@ def summary_text(summary: "Summary") -> str:
         f"  leaks {s.leaks} (most {s.most_leaks}), wall corrections {s.wall_corrections}\n"
         f"  compression {1e2 * s.compression_p99:.2f} % (99th percentile; "
         f"most {1e2 * s.most_compression_p99:.2f} %), kinetic energy {s.kinetic_energy:.3g} J"
+        + (
+            f"\n  the physics took over for {1e2 * s.fallback_share:.2g} % of the time"
+            if s.fallback_share
+            else ""
+        )
     )
 
 
@@ -248,17 +254,14 @@ def summary_text(summary: "Summary") -> str:
 @click.option(
     "--hold-out",
     type=click.IntRange(min=0),
-    default=0,
+    multiple=True,
+    default=(0,),
     show_default=True,
-    help="Run of the data that chooses the weights and is not trained on.",
+    help="Run of the data that is not trained on; the first one given chooses the weights.",
 )
-@click.option("--iterations", type=click.IntRange(min=1), default=1600, show_default=True)
+@click.option("--iterations", type=click.IntRange(min=1), default=600, show_default=True)
 @click.option(
-    "--minutes",
-    type=click.FloatRange(min=0, min_open=True),
-    default=20.0,
-    show_default=True,
-    help="Stop after so much wall time.",
+    "--plot", type=output_path, metavar="FILE", help="Draw loss and rollouts into a picture (PNG)."
 )
 @arch_option
 @threads_option
@@ -268,37 +271,27 @@ def train(
     out: Path,
     head: str,
     correction: str,
-    hold_out: int,
+    hold_out: tuple[int, ...],
     iterations: int,
-    minutes: float,
+    plot: Path | None,
     arch: str,
     threads: int | None,
     seed: int,
 ) -> int:
-    """Train PcNet on recorded runs; the best rollout on the held-out run is kept."""
-    import importlib.util
+    """Train PcNet on recorded runs; the best rollout on the held-out run is kept.
 
-    from app.output import check_output
+    A training that was cut short goes on where it was.
+    """
+    from app import learn
 
-    if importlib.util.find_spec("torch") is None:
-        raise InputError("train: torch is not installed; pip install 'vesselflow[train]'")
-    check_output(out, "--out", b"PK")
-
-    from nn.train import Settings, train_weights
-    from taichi_sph.runtime import start
-
-    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
-        start(arch, "f32", threads, random_seed=seed)
-    settings = Settings(
-        head=head, correction=correction, iterations=iterations, minutes=minutes, seed=seed
-    )
     command = f"vesselflow train {data.name} --head {head} --correction {correction}"
-    command += f" --hold-out {hold_out} --iterations {iterations} --seed {seed}"
-    weights = train_weights(
-        data, out, settings, hold_out, command, report=lambda line: click.echo(line, err=True)
-    )
-    figures = ", ".join(f"{k} {v:.3f}" for k, v in weights.training.validation.items())
-    click.echo(f"{out}: {figures}")
+    command += "".join(f" --hold-out {run}" for run in hold_out)
+    command += f" --iterations {iterations} --seed {seed}"
+    learn.require_torch("train")
+    from nn.train import Settings
+
+    settings = Settings(head=head, correction=correction, iterations=iterations, seed=seed)
+    click.echo(learn.train(data, out, settings, hold_out, command, plot, arch, threads))
     return 0
 
 
@@ -330,7 +323,7 @@ class Heights(click.ParamType):
 @click.option(
     "--substeps",
     type=click.IntRange(min=1),
-    default=4,
+    default=8,
     show_default=True,
     help="Steps of the physics in a frame.",
 )
@@ -430,6 +423,7 @@ def validate(
 @click.option("--peer", is_flag=True, help="Measure SPlisHSPlasH beside, on a like column.")
 @click.option("--scale", is_flag=True, help="Measure from 16 000 to 250 000 particles.")
 @click.option("--start-up", is_flag=True, help="Measure the time to the first frame.")
+@click.option("--split", is_flag=True, help="Measure each pass of a step.")
 @click.option(
     "--json", "json_file", type=output_path, metavar="FILE", help="Write figures as JSON."
 )
@@ -440,6 +434,7 @@ def bench(
     peer: bool,
     scale: bool,
     start_up: bool,
+    split: bool,
     json_file: Path | None,
 ) -> int:
     """Measure the speed on scenes (A by default)."""
@@ -450,7 +445,106 @@ def bench(
     if json_file is not None:
         check_output(json_file, "--json", b"{")
     scenes = [scene_path(name) for name in scene_names or ("A",)]
-    return benchmark.main(scenes, arch, threads, peer, scale, start_up, json_file)
+    return benchmark.main(scenes, arch, threads, peer, scale, start_up, split, json_file)
+
+
+@cli.command()
+@click.argument("data", type=output_path, nargs=-1, required=True)
+@click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (JSON).")
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True)
+@click.option("--iterations", type=click.IntRange(min=1), default=300, show_default=True)
+@click.option("--processes", type=click.IntRange(min=1), default=1, show_default=True)
+@click.option("--plot", type=output_path, metavar="FILE", help="Draw the ladder (PNG).")
+@arch_option
+def ladder(
+    data: tuple[Path, ...],
+    out: Path,
+    seeds: int,
+    iterations: int,
+    processes: int,
+    plot: Path | None,
+    arch: str,
+) -> int:
+    """Train every kind of network on recorded runs and roll each out on a run it never saw.
+
+    Run 0 of each dataset chooses the weights, the last one measures them.
+    """
+    from app import learn
+    from app.output import check_output
+
+    learn.require_torch("ladder")
+    check_output(out, "--out", b"{")
+    learn.check_plot(plot)
+    from app import ladder as study
+
+    study.main(list(data), out, seeds, iterations, processes, plot, arch)
+    return 0
+
+
+@cli.command()
+@click.argument("scene_name", metavar="SCENE")
+@click.option(
+    "--weights",
+    "weights",
+    type=output_path,
+    multiple=True,
+    metavar="FILE",
+    help="Weights to pour with; may be given again.  [default: as run]",
+)
+@click.option(
+    "--soft",
+    type=click.FloatRange(min=1, min_open=True),
+    multiple=True,
+    metavar="RATIO",
+    help="Physics with this sound speed over the scene's speed beside; may be given again.",
+)
+@click.option("--particles", type=click.IntRange(min=1), help="Blood particles.")
+@click.option(
+    "--height", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="Column [m]."
+)
+@click.option(
+    "--until",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Simulated time to stop at [s].  [default: the scene's duration]",
+)
+@click.option("--json", "json_file", type=output_path, metavar="FILE", help="Write figures.")
+@click.option("--plot", type=output_path, metavar="FILE", help="Draw the curves (PNG).")
+@arch_option
+@threads_option
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def compare(
+    scene_name: str,
+    weights: tuple[Path, ...],
+    soft: tuple[float, ...],
+    particles: int | None,
+    height: float | None,
+    until: float | None,
+    json_file: Path | None,
+    plot: Path | None,
+    arch: str,
+    threads: int | None,
+    seed: int,
+) -> int:
+    """Pour a scene by physics and by networks side by side, and measure the difference."""
+    from app import compare as comparison
+    from app.learn import check_plot
+    from app.output import check_output
+    from app.scenes import find_scene, weights_for
+    from taichi_sph.runtime import start
+
+    scene = with_column(find_scene(scene_name), particles, height)
+    if json_file is not None:
+        check_output(json_file, "--json", b"{")
+    check_plot(plot)
+    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
+        start(arch, "f32", threads, random_seed=seed)
+    files = list(weights) or [weights_for(scene)]
+    results = comparison.compare(
+        scene, files, list(soft), until or scene.duration, seed, json_file, plot
+    )
+    comparison.print_results(scene, results)
+    return 0
 
 
 def console() -> "Console":

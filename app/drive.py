@@ -62,6 +62,8 @@ class Summary:
     """Live at the end."""
     drained_volume: float
     """[m^3]"""
+    fallback_share: float
+    """Part of the simulated time in which the model fell back to the physics."""
     diverged: bool
     ending: str
 
@@ -220,6 +222,7 @@ def drive(
         kinetic_energy=figures.kinetic_energy,
         particles=figures.particles,
         drained_volume=figures.drained_volume,
+        fallback_share=figures.fallback_share,
         diverged=isinstance(error, RunError),
         ending=ending,
     )

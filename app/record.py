@@ -79,7 +79,7 @@ def record(
     heights: Sequence[float],
     frames: int,
     out: Path,
-    substeps: int = 4,
+    substeps: int = 8,
     features: bool = False,
     processes: int = 1,
     arch: str = "cpu",
@@ -268,8 +268,9 @@ def record_run(task: Task, report: Callable[[int, int], None]) -> None:
         start(facts.architecture, "f32", task.threads, random_seed=facts.seed)
     simulation = Stage(task.scene, read_vessel(task.scene), facts.seed)
     scales = FeatureScales(
-        facts.support_radius, facts.spacing, facts.frame_interval, facts.sound_speed
-    )
+        facts.support_radius, facts.spacing, facts.frame_interval, facts.sound_speed,
+        task.scene.discretization.wall_spacing_ratio,
+    )  # fmt: skip
     wall = simulation.wall
     proxies = Proxies(*(f.to_numpy() for f in (wall.position, wall.normal, wall.volume)))
     with RunWriter(task.part, facts, proxies, _feature_count(facts)) as writer:

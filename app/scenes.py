@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from taichi_sph.wall_sampling import WallSample
 
 
+WEIGHTS = "pcnet.npz"
+"""File of the network's weights in the folder of a scene."""
+
+
 def vessels_folder() -> Path:
     """Folder of the shipped vessels: inside the installed package, else in the source tree.
 
@@ -66,6 +70,12 @@ def find_scene(given: str) -> Scene:
         InputError: there is no such scene, or its file has a mistake.
     """
     return read_scene(scene_path(given))
+
+
+def weights_for(scene: Scene) -> Path:
+    """Weights to pour a scene with: those beside it, or the aorta's, which serve any vessel."""
+    own = Path(scene.folder) / WEIGHTS
+    return own if own.is_file() else shipped()["aortoiliac"].parent / WEIGHTS
 
 
 def scenes_table() -> Table:

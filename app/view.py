@@ -65,6 +65,7 @@ PLOTS: dict[str, tuple[str, tuple[tuple[str, tuple[int, int, int]], ...]]] = {
         (("leaks", (255, 90, 200)), ("corrections since the start", (160, 130, 255))),
     ),
     "step": ("time step [ms]", (("time step", (140, 220, 140)),)),
+    "guard": ("taken over by the physics [%]", (("of the time so far", (230, 190, 120)),)),
 }
 """Plots by entity: title, and name and colour of each line."""
 
@@ -419,6 +420,7 @@ class RerunView:
             ("volume", [1e6 * in_vessel, 1e6 * figures.drained_volume]),
             ("wall", [figures.leaks, figures.wall_corrections]),
             ("step", [1e3 * figures.step]),
+            ("guard", [1e2 * figures.fallback_share]),
         ):
             items.append((f"plots/{entity}", rr.Scalars(values)))
         self._last = (frame, figures.time)

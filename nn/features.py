@@ -12,7 +12,7 @@
 | 13 | skewness of the binned v_ij | likewise | - | 1 |
 | 14 | kurtosis of the binned r_ij (Eq. 24) | likewise | - | 1 |
 | 15 | kurtosis of the binned v_ij | likewise | - | 1 |
-| 16 | M | proxies, r_ik < R | - | 1/N_0 |
+| 16 | M | proxies, r_ik < R | - | (wall spacing/d)^2/N_0 |
 | 17-19 | mean of r_k - r_i over proxies | 0 for M = 0 | m | 1/R |
 | 20 | variance of r_ik | 0 for M = 0 | m^2 | 1/R^2 |
 | 21 | skewness of the binned r_ik | 0 where the bins' variance is 0 | - | 1 |
@@ -36,7 +36,7 @@ COUNT = 23
 EXTENDED = 25
 """With two more, for density is not among the paper's: 50 max(rho/rho_0 - 1, 0) and T div v."""
 BINS = 6
-TABLE_VERSION = 1
+TABLE_VERSION = 2
 """Raised when a definition above changes; weights of another version are refused."""
 
 NAMES = (
@@ -60,6 +60,8 @@ class FeatureScales:
     """T [s]."""
     sound_speed: float
     """c [m/s]."""
+    wall_spacing_ratio: float = 1.0
+    """Proxy spacing over d."""
 
     @property
     def speed(self) -> float:
@@ -80,6 +82,27 @@ class FeatureScales:
     def neighbours(self) -> float:
         """N_0: neighbours of a lattice, 4/3 pi (R/d)^3."""
         return 4.0 / 3.0 * math.pi * (self.support_radius / self.spacing) ** 3
+
+    @property
+    def proxies(self) -> float:
+        """What M is divided by: N_0/(wall spacing/d)^2, so that a finer wall counts the same."""
+        return self.neighbours / self.wall_spacing_ratio**2
+
+
+@ti.data_oriented
+@dataclass(frozen=True)
+class Inputs:
+    """Which features a network sees; the kernels work out no others."""
+
+    index: tuple[int, ...]
+    """Rows of the table above, then compression and divergence."""
+
+    def among(self, *rows: int) -> bool:
+        """Whether any of these rows is seen."""
+        return any(row in self.index for row in rows)
+
+
+ALL = Inputs(tuple(range(EXTENDED)))
 
 
 @ti.func
@@ -120,23 +143,30 @@ def features_of(
     nb: ti.template(),
     fluid: ti.template(),
     scales: ti.template(),
+    inputs: ti.template(),
 ):
-    """The 23 features of particle i, dimensionless (last column of the table), and three more.
+    """The 23 features of particle i, dimensionless (last column of the table), and four more.
 
-    The three are 50 max(rho/rho_0 - 1, 0) by Eq. 2, T div v (the rate at which that density falls)
-    and rho/rho_0 itself, which no network sees.  Reads: position, velocity, acceleration.
+    The four are 50 max(rho/rho_0 - 1, 0) by Eq. 2, T div v (the rate at which that density falls),
+    and, which no network sees, rho/rho_0 and R^2 (|sum_j G_j|^2 + sum_j |G_j|^2): how much the
+    density answers to a pressure of the particle itself, with G = grad W m/rho_0, the wall's in the
+    first sum only (Bender and Koschier 2017, doi:10.1109/TVCG.2016.2578335, eq. 9).
+    What `inputs` leaves out is 0.  Reads: position, velocity, acceleration.
     """
-    f = ti.Vector([0.0] * 26)
+    f = ti.Vector([0.0] * 27)
     x_i = p.position[i]
     v_i = p.velocity[i]
-    a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
-    for a in ti.static(range(3)):
-        f[a] = a_i[a]
+    if ti.static(inputs.among(0, 1, 2)):
+        a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
+        for a in ti.static(range(3)):
+            f[a] = a_i[a]
     per_length = ti.static(1.0 / scales.support_radius)
     per_speed = ti.static(1.0 / scales.speed)
 
     blood = fluid.kernel.w(0.0)
     blood_rate = 0.0
+    gradient = ti.Vector([0.0, 0.0, 0.0])
+    gradient2 = 0.0
     n = 0.0
     r_sum = ti.Vector([0.0, 0.0, 0.0])
     v_sum = ti.Vector([0.0, 0.0, 0.0])
@@ -150,20 +180,29 @@ def features_of(
         q = r_ji.norm()
         if q < 1.0:
             v_ji = (p.velocity[j] - v_i) * per_speed
-            u = v_ji.norm()
             n += 1.0
-            r_sum += r_ji
-            v_sum += v_ji
-            # From the middle of its range: the variance then loses no digits.
-            distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
-            speed += ti.Vector([u, u * u])
-            b = bin_of(q)
-            distance_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
             r = q * ti.static(scales.support_radius)
             blood += fluid.kernel.w(r)
-            blood_rate += fluid.kernel.slope(r) * v_ji.dot(r_ji)
-            c = bin_of(u)
-            speed_bins += ti.Vector([c, c * c, c * c * c, c * c * c * c])
+            slope = fluid.kernel.slope(r)
+            blood_rate += slope * v_ji.dot(r_ji)
+            gradient += slope * r_ji
+            gradient2 += (slope * q) ** 2
+            if ti.static(inputs.among(4, 5, 6)):
+                r_sum += r_ji
+            if ti.static(inputs.among(7, 8, 9)):
+                v_sum += v_ji
+            if ti.static(inputs.among(10)):
+                # From the middle of its range: the variance then loses no digits.
+                distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
+            if ti.static(inputs.among(12, 14)):
+                b = bin_of(q)
+                distance_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
+            if ti.static(inputs.among(11, 13, 15)):
+                u = v_ji.norm()
+                speed += ti.Vector([u, u * u])
+                if ti.static(inputs.among(13, 15)):
+                    c = bin_of(u)
+                    speed_bins += ti.Vector([c, c * c, c * c * c, c * c * c * c])
     if n > 0.0:
         f[3] = n * ti.static(1.0 / scales.neighbours)
         for a in ti.static(range(3)):
@@ -171,17 +210,19 @@ def features_of(
             f[7 + a] = v_sum[a] / n
         f[10] = ti.max(0.0, distance[1] / n - (distance[0] / n) ** 2)
         f[11] = ti.max(0.0, speed[1] / n - (speed[0] / n) ** 2)
-        s = distance_bins
-        shape = central_moments(n, s[0], s[1], s[2], s[3])
-        f[12] = shape[0]
-        f[14] = shape[1]
-        s2 = speed_bins
-        shape2 = central_moments(n, s2[0], s2[1], s2[2], s2[3])
-        f[13] = shape2[0]
-        f[15] = shape2[1]
+        if ti.static(inputs.among(12, 14)):
+            s = distance_bins
+            shape = central_moments(n, s[0], s[1], s[2], s[3])
+            f[12] = shape[0]
+            f[14] = shape[1]
+        if ti.static(inputs.among(13, 15)):
+            s2 = speed_bins
+            shape2 = central_moments(n, s2[0], s2[1], s2[2], s2[3])
+            f[13] = shape2[0]
+            f[15] = shape2[1]
 
     behind = 0.0
-    behind_rate = 0.0
+    wall_gradient = ti.Vector([0.0, 0.0, 0.0])
     m = 0.0
     wall_sum = ti.Vector([0.0, 0.0, 0.0])
     wall_distance = ti.Vector([0.0, 0.0])
@@ -192,29 +233,35 @@ def features_of(
         q = r_ki.norm()
         if q < 1.0:
             m += 1.0
-            wall_sum += r_ki
-            wall_distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
-            b = bin_of(q)
-            wall_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
             r = q * ti.static(scales.support_radius)
             behind += w.volume[kk] * fluid.kernel.w(r)
-            behind_rate -= w.volume[kk] * fluid.kernel.slope(r) * v_i.dot(r_ki)
+            wall_gradient += (w.volume[kk] * fluid.kernel.slope(r)) * r_ki
+            if ti.static(inputs.among(17, 18, 19)):
+                wall_sum += r_ki
+            if ti.static(inputs.among(20)):
+                wall_distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
+            if ti.static(inputs.among(21, 22)):
+                b = bin_of(q)
+                wall_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
     if m > 0.0:
-        f[16] = m * ti.static(1.0 / scales.neighbours)
+        f[16] = m * ti.static(1.0 / scales.proxies)
         for a in ti.static(range(3)):
             f[17 + a] = wall_sum[a] / m
         f[20] = ti.max(0.0, wall_distance[1] / m - (wall_distance[0] / m) ** 2)
-        s3 = wall_bins
-        shape3 = central_moments(m, s3[0], s3[1], s3[2], s3[3])
-        f[21] = shape3[0]
-        f[22] = shape3[1]
+        if ti.static(inputs.among(21, 22)):
+            s3 = wall_bins
+            shape3 = central_moments(m, s3[0], s3[1], s3[2], s3[3])
+            f[21] = shape3[0]
+            f[22] = shape3[1]
     # d(rho_i)/dt = sum_j m slope r_ij.v_ij, and r_ij.v_ij = r_ji.v_ji.
     share = ti.static(fluid.calibration.mass / fluid.state.rest_density)
     gamma = ti.static(fluid.calibration.wall_density)
     f[25] = share * blood + gamma * behind
     f[23] = 50.0 * ti.max(0.0, f[25] - 1.0)
-    rate = share * blood_rate * ti.static(scales.speed) + gamma * behind_rate
+    rate = share * blood_rate * ti.static(scales.speed) - gamma * v_i.dot(wall_gradient)
     f[24] = -rate * ti.static(scales.support_radius * scales.frame_interval)
+    one_sided = share * gradient + gamma * wall_gradient
+    f[26] = ti.static(scales.support_radius**4) * (one_sided.norm_sqr() + share**2 * gradient2)
     return f
 
 
@@ -227,8 +274,8 @@ def extract(
     scales: ti.template(),
     out: ti.types.ndarray(dtype=float, ndim=2),
 ):
-    """Features and rho/rho_0 of every live particle.  Writes: out[identity, 26]."""
+    """What `features_of` gives, for every live particle.  Writes: out[identity, 27]."""
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, fluid, scales)
-        for k in ti.static(range(26)):
+        f = features_of(i, p, w, nb, fluid, scales, ALL)
+        for k in ti.static(range(27)):
             out[p.identity[i], k] = f[k]

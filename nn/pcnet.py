@@ -1,15 +1,24 @@
 """PcNet: a small network in the place of the physics, in Taichi kernels.
 
-Two heads.  `direct` is the paper's: 23 features in, the acceleration out.  `pressure` gives each
-particle two numbers that are not negative, a pressure term p/rho^2 and a viscosity, and the
-physics' own pairwise sum applies both sides' numbers: momentum is conserved, the wall pushes in and
-viscosity dissipates whatever the weights.  Weakly compressible SPH is the special case in which
-the first number is Tait's; trained over a longer step it becomes what that step needs.
+Two heads, each a network with three outputs.  `direct` is the paper's: 23 features in, the
+acceleration out.  `pressure` looks at two more (density is not among the paper's) and gives three
+coefficients of the physics' own pairwise sum, none of them negative: momentum is conserved, blood
+is pushed apart, the wall pushes in and viscosity dissipates whatever the weights.
 
-    p_i/rho_i^2 = 0.1 (R/T)^2/rho_0 softplus(o_0)
-    mu_i        = 0.03 rho_0 R^2/T  sigmoid(o_1)
+    p_i/rho_i^2 = max(0, k_i (rho_i/rho_0 - 1) - g_i T div v_i) / (T^2 rho_0 D_i)
+    mu_i        = min(eta exp(o_2), 0.03 rho_0 R^2/T)
+    k_i = 0.8 sigmoid(o_0),  g_i = 0.1 sigmoid(o_1)
 
-The factors are the largest that an explicit step T bears (Courant and viscous limits).
+D_i is how much the particle's density answers to its own pressure (see `features_of`): with
+k = g = 1 this is the first iteration of divergence-free SPH.  A step is stable where k + 2 g stays
+under 4 over the largest eigenvalue of v -> D^-1 grad div v, which is 3.8 on the most disordered
+cloud tried: the factors hold that for any weights.  Weakly compressible SPH, linearised, is
+k = (c T/R)^2 R^2 D, g = 0.  Viscosity is learned as a multiple of the blood's own at high shear,
+eta; its bound is what an explicit step T bears (Morris et al. 1997).  Monaghan's artificial term
+stays as the scene has it.
+
+Everything is dimensionless, so weights serve any spacing whose scene has the same proportions:
+the step is T = C R/c with the trained C, the sound speed c and the support radius R the scene's.
 """
 
 from collections.abc import Callable
@@ -20,9 +29,9 @@ from pathlib import Path
 import numpy as np
 import taichi as ti
 
-from nn.features import FeatureScales, features_of
-from nn.weights import CLIP, Weights, require_fit
-from taichi_sph.acceleration import Fluid, sum_acceleration
+from nn.features import FeatureScales, Inputs, features_of
+from nn.weights import CLIP, Weights, proportions, require_fit
+from taichi_sph.acceleration import Fluid, SphAcceleration, sum_acceleration
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
 from taichi_sph.rheology import Casson
@@ -31,14 +40,24 @@ from taichi_sph.wall import Wall
 
 VARIABLE = Casson(eta=1.0, tau_y=0.0, n=1.0)
 """Tells the pairwise sum that viscosity differs from particle to particle; never evaluated."""
-PRESSURE_FACTOR = 0.1
-VISCOSITY_FACTOR = 0.03
+LARGEST_STIFFNESS = 0.8
+LARGEST_DAMPING = 0.1
+LARGEST_VISCOSITY = 0.03
+LARGEST_EXPONENT = 10.0
+"""Keeps exp finite in single precision, long after the bound has taken over."""
+LARGEST_COMPRESSION = 0.1
+"""What the direct head may let happen; the physics stays under 0.02."""
+LARGEST_ADVANCE = 0.4
+"""Way of a particle in a step, over R; twice what blood does in the runs of docs/learned.md."""
+LEAST_RESPONSE = 0.5
+"""R^2 D is 1.8 on a lattice; a lone pair that hardly touches must not be thrown apart."""
 
 
 @dataclass(eq=False)
 class Network:
     """The weights in Taichi fields, flat, layer after layer."""
 
+    inputs: Inputs
     sizes: tuple[int, ...]
     mean: tuple[float, ...]
     deviation: tuple[float, ...]
@@ -67,6 +86,7 @@ class Network:
     def upload(cls, weights: Weights) -> "Network":
         """Fields for these weights."""
         network = cls(
+            weights.training.columns,
             weights.sizes,
             tuple(map(float, weights.mean)),
             tuple(map(float, weights.deviation)),
@@ -85,14 +105,18 @@ class Network:
 
 @ti.func
 def evaluate(network: ti.template(), f: ti.template()):
-    """Outputs of the network for a feature vector: tanh between layers.
+    """Outputs of the network for a feature vector: softsign, x/(1 + |x|), between layers.
+
+    The paper names no activation; tanh costs ten times as much, more than all the features.
 
     Everything is unrolled and every vector filled entry by entry: Taichi 1.7.4 miscompiles local
     vectors that are assigned whole and then read.
     """
-    x = ti.Vector([0.0] * network.sizes[0])
+    x = ti.Vector([0.0] * (network.sizes[0] + 1))  # no network is too small for a vector
     for k in ti.static(range(network.sizes[0])):
-        z = (f[k] - ti.static(network.mean[k])) * ti.static(1.0 / network.deviation[k])
+        z = (f[ti.static(network.inputs.index[k])] - ti.static(network.mean[k])) * ti.static(
+            1.0 / network.deviation[k]
+        )
         x[k] = ti.max(-CLIP, ti.min(CLIP, z))
     hidden = ti.Vector([0.0] * network.widest)
     before = ti.Vector([0.0] * network.widest)
@@ -109,7 +133,7 @@ def evaluate(network: ti.template(), f: ti.template()):
                 else:
                     total += network.weight[w_first + o * n_in + k] * before[k]
             if ti.static(layer + 2 < len(network.sizes)):
-                total = ti.tanh(total)
+                total = total / (1.0 + ti.abs(total))
             hidden[o] = total
         for o in ti.static(range(n_out)):
             before[o] = hidden[o]
@@ -119,23 +143,27 @@ def evaluate(network: ti.template(), f: ti.template()):
 
 
 class PcNet:
-    """The learned acceleration; stands where `SphAcceleration` stands."""
+    """The learned acceleration; stands where `SphAcceleration` stands.
+
+    The pressure head cannot run away, and takes shorter steps only where blood is faster than
+    LARGEST_ADVANCE allows.  The direct head can: while a particle is compressed or fast beyond all
+    training, the physics takes over.  (Under the pressure head it must not: stiff physics throws
+    apart what a soft pressure has let come close.  It killed a run that lives without.)
+    """
 
     name = "pcnet"
 
-    def __init__(self, weights: Weights, fluid: Fluid, capacity: int):
+    def __init__(self, weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int):
         """Make the scratch fields for `capacity` particles."""
-        training = weights.training
-        self.training = training
+        self.head = weights.training.head
         self.network = Network.upload(weights)
-        self.fluid = replace(fluid, rheology=VARIABLE, artificial_viscosity=0.0, nested=False)
-        self.scales = scales_of(weights)
-        self.pressure_term = ti.field(float, capacity)
-        self.viscosity = ti.field(float, capacity)
-        self.next_acceleration = ti.Vector.field(
-            3, float, capacity if training.head == "direct" else 1
-        )
-        self.stress = ti.Matrix.field(3, 3, float, 1)
+        self.fluid = replace(fluid, rheology=VARIABLE, nested=False)
+        self.scales = scales
+        self.physics = SphAcceleration(fluid, capacity)
+        self.guarded = True
+        """Whether the physics may take over."""
+        self.fell_back = False
+        self.next_acceleration = ti.Vector.field(3, float, capacity if self.head == "direct" else 1)
 
     def accelerate(
         self,
@@ -145,51 +173,71 @@ class PcNet:
         gravity: tuple[float, float, float],
     ) -> None:
         """Features and network, then (pressure head) the pairwise sum."""
-        if self.training.head == "direct":
-            predict_acceleration(
+        scratch = self.physics.pressure_term, self.physics.viscosity
+        if self.head == "direct":
+            alarms = predict_acceleration(
                 particles, wall, neighbors, self.fluid, self.scales, self.network,
                 self.next_acceleration,
             )  # fmt: skip
-            return
+            self.fell_back = self.guarded and alarms > 0
+            if self.fell_back:
+                self.physics.accelerate(particles, wall, neighbors, gravity)
+            else:
+                copy_vectors(particles, self.next_acceleration)
+        else:
+            self.predict(particles, wall, neighbors)
+            sum_acceleration(
+                particles, wall, neighbors, self.fluid, *scratch, self.physics.stress,
+                ti.Vector(gravity),
+            )  # fmt: skip
+
+    def predict(self, particles: Particles, wall: Wall, neighbors: Neighbors) -> None:
+        """Pressure and viscosity of each particle, by the pressure head."""
+        physics = self.physics
         predict_pressure(
             particles, wall, neighbors, self.fluid, self.scales, self.network,
-            self.pressure_term, self.viscosity,
-        )  # fmt: skip
-        sum_acceleration(
-            particles, wall, neighbors, self.fluid, self.pressure_term, self.viscosity,
-            self.stress, ti.Vector(gravity),
+            physics.pressure_term, physics.viscosity, physics.fluid.rheology.eta,
         )  # fmt: skip
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
-        """The trained step [s]: a network knows no other."""
-        return self.training.frame_interval
+        """The trained step [s], or less: LARGEST_ADVANCE at most, or the physics' own."""
+        if self.fell_back:
+            return self.physics.stable_step(largest_speed, largest_acceleration)
+        largest = self.scales.speed_limit * LARGEST_ADVANCE
+        return self.scales.frame_interval * min(1.0, largest / max(largest_speed, largest))
 
 
-def scales_of(weights: Weights) -> FeatureScales:
-    """What the weights' features are measured in."""
-    t = weights.training
-    return FeatureScales(t.support_radius, t.spacing, t.frame_interval, t.sound_speed)
+def scales_of(weights: Weights, fluid: Fluid, spacing: float, wall_ratio: float) -> FeatureScales:
+    """What features are measured in where blood is `fluid` at a spacing [m]."""
+    radius, sound = fluid.kernel.support_radius, fluid.state.sound_speed
+    interval = weights.training.courant_number * radius / sound
+    return FeatureScales(radius, spacing, interval, sound, wall_ratio)
 
 
 def load_pcnet(path: Path, scene: Scene) -> Callable[[Fluid, int], PcNet]:
     """A maker of PcNet models for `Simulation`, from a weights file for a scene.
 
     Raises:
-        InputError: not weights, or weights for another scene.
+        InputError: not weights, or (from the maker) weights for a scene of other proportions.
     """
     weights = Weights.load(path)
     grid = scene.discretization
-    found = {
-        "spacing": grid.spacing,
-        "support_radius": grid.support_ratio * grid.spacing,
-        "wall_spacing_ratio": grid.wall_spacing_ratio,
-    }
-    require_fit(weights, str(path), found)
 
     def make(fluid: Fluid, capacity: int) -> PcNet:
-        return PcNet(weights, fluid, capacity)
+        found = {"support_ratio": grid.support_ratio, **proportions(fluid)}
+        require_fit(weights, str(path), found)
+        scales = scales_of(weights, fluid, grid.spacing, grid.wall_spacing_ratio)
+        return PcNet(weights, fluid, scales, capacity)
 
     return make
+
+
+@ti.func
+def beyond_training(f, velocity, scales: ti.template()):
+    """1 if a particle with these features must not be left to a network, else 0."""
+    dense = f[25] > ti.static(1.0 + LARGEST_COMPRESSION)
+    fast = velocity.norm() > ti.static(LARGEST_ADVANCE * scales.speed_limit)
+    return int(dense or fast)
 
 
 @ti.kernel
@@ -201,19 +249,33 @@ def predict_acceleration(
     scales: ti.template(),
     network: ti.template(),
     out: ti.template(),
-):
+) -> int:
     """a_i^{n+1} = net(F_i) (paper, Algorithm 2); it knows gravity or nothing does.
 
-    Writes: acceleration, density.
+    Returns how many particles are beyond training.  Writes: out, density.
     """
+    alarms = 0
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, fluid, scales)
+        f = features_of(i, p, w, nb, fluid, scales, network.inputs)
+        alarms += beyond_training(f, p.velocity[i], scales)
         p.density[i] = f[25] * ti.static(fluid.state.rest_density)
         o = evaluate(network, f)
         for a in ti.static(range(3)):
             out[i][a] = o[a] * ti.static(scales.acceleration)
+    return alarms
+
+
+@ti.kernel
+def copy_vectors(p: ti.template(), a: ti.template()):
+    """Writes: acceleration."""
     for i in range(p.count[None]):
-        p.acceleration[i] = out[i]
+        p.acceleration[i] = a[i]
+
+
+@ti.func
+def sigmoid(x):
+    """1/(1 + exp(-x))."""
+    return 1.0 / (1.0 + ti.exp(-x))
 
 
 @ti.kernel
@@ -226,17 +288,24 @@ def predict_pressure(
     network: ti.template(),
     pressure_term: ti.template(),
     viscosity: ti.template(),
+    eta: float,
 ):
-    """The pressure head's two numbers.  Writes: pressure_term, viscosity, density."""
+    """The pressure head's p/rho^2 and mu.  Writes: pressure_term, viscosity, density."""
     rest_density = ti.static(fluid.state.rest_density)
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, fluid, scales)
+        f = features_of(i, p, w, nb, fluid, scales, network.inputs)
         p.density[i] = f[25] * rest_density
         o = evaluate(network, f)
-        softplus = ti.max(o[0], 0.0) + ti.log(1.0 + ti.exp(-ti.abs(o[0])))
-        pressure_term[i] = ti.static(PRESSURE_FACTOR * scales.speed_limit**2 / rest_density) * (
-            softplus
+        excess = LARGEST_STIFFNESS * sigmoid(o[0]) * (f[25] - 1.0)
+        excess -= LARGEST_DAMPING * sigmoid(o[1]) * f[24]
+        pressure_term[i] = (
+            ti.static(scales.speed_limit**2 / rest_density)
+            * ti.max(0.0, excess)
+            / ti.max(LEAST_RESPONSE, f[26])
         )
-        viscosity[i] = ti.static(
-            VISCOSITY_FACTOR * rest_density * scales.support_radius * scales.speed_limit
-        ) / (1.0 + ti.exp(-o[1]))
+        viscosity[i] = ti.min(
+            ti.static(
+                LARGEST_VISCOSITY * rest_density * scales.support_radius * scales.speed_limit
+            ),
+            eta * ti.exp(ti.min(o[2], LARGEST_EXPONENT)),
+        )

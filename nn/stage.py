@@ -26,7 +26,7 @@ class Stage(Simulation):
         super().__init__(scene, vessel, self._make_model, seed)
         self.step_limit = self.derived.step
         self._taken: list[float] = []
-        self._features = ti.ndarray(float, (self.particles.capacity, EXTENDED + 1))
+        self._features = ti.ndarray(float, (self.particles.capacity, EXTENDED + 2))
 
     def _make_model(self, fluid: Fluid, capacity: int) -> SphAcceleration:
         self.fluid = fluid
@@ -87,14 +87,7 @@ class Stage(Simulation):
         particles.acceleration.from_numpy(rows)
 
     def features(self, scales: FeatureScales) -> np.ndarray:
-        """Features of the state as it stands, a row a particle, (n, 25)."""
-        return self._extract(scales)[:, :EXTENDED]
-
-    def density_ratio(self, scales: FeatureScales) -> np.ndarray:
-        """rho/rho_0 of the state as it stands, (n,)."""
-        return self._extract(scales)[:, EXTENDED]
-
-    def _extract(self, scales: FeatureScales) -> np.ndarray:
+        """What `nn.features.features_of` gives for the state as it stands, a row a particle."""
         self._features.fill(0.0)
         extract(self.particles, self.wall, self.neighbors, self.fluid, scales, self._features)
         return self._features.to_numpy()

@@ -15,21 +15,30 @@ is kept, not the one with the lowest loss.
 
 import hashlib
 import itertools
-import json
 import math
+import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from nn.dataset import Dataset, Run
-from nn.features import COUNT, EXTENDED, FeatureScales
-from nn.pcnet import PRESSURE_FACTOR, VISCOSITY_FACTOR, PcNet
+from nn.features import COUNT, NAMES, FeatureScales
+from nn.pcnet import (
+    LARGEST_DAMPING,
+    LARGEST_EXPONENT,
+    LARGEST_STIFFNESS,
+    LARGEST_VISCOSITY,
+    LEAST_RESPONSE,
+    PcNet,
+)
 from nn.stage import Stage
-from nn.weights import CLIP, Training, Weights
+from nn.weights import CLIP, Training, Weights, proportions
+from taichi_sph.acceleration import AccelerationModel
 from taichi_sph.calibration import softening
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.vessel import read_vessel
@@ -44,6 +53,18 @@ DEPTH = 3
 DEVIATION_FLOOR = 1e-3
 """Inputs that hardly vary in training must not be blown up by their deviation."""
 
+DIED = 0.3
+"""99th percentile of compression at which a rollout counts as dead."""
+
+INPUTS = {"direct": NAMES[:COUNT], "pressure": ("N", "D_rv_b", "M", "compression", "divergence")}
+"""Features that each head sees by default."""
+
+
+def use_threads(threads: int | None) -> None:
+    """Let torch have so many threads; all of them if None."""
+    if threads:
+        torch.set_num_threads(threads)
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -51,7 +72,9 @@ class Settings:
 
     head: str = "pressure"
     correction: str = "relabel"
-    iterations: int = 1600
+    inputs: tuple[str, ...] | None = None
+    """Features seen; the head's of INPUTS if None."""
+    iterations: int = 600
     """Gradient steps."""
     batch: int = 4096
     """Particles a step of the direct head; the pressure head takes the whole frame."""
@@ -59,10 +82,8 @@ class Settings:
     seed: int = 0
     drift: int = 10
     """Longest rollout before a drifted sample, reached halfway (relabel) [frames]."""
-    validate_every: int = 200
+    validate_every: int = 100
     """Gradient steps between two rollouts on the held-out run."""
-    minutes: float = 20.0
-    """Stop after this much wall time."""
 
 
 class Sample:
@@ -81,6 +102,7 @@ class Sample:
         particles, nb = stage.particles, stage.neighbors
         n = particles.count[None]
         identity = particles.identity.to_numpy()[:n]
+        self.identity = identity
         self.features = _f32(stage.features(scales)[identity])
         self.target = torch.from_numpy(target[identity].astype(np.float32))
         self.valid = torch.from_numpy(valid[identity])
@@ -89,21 +111,24 @@ class Sample:
         kernel, factors = fluid.kernel, fluid.calibration
         x = particles.position.to_numpy()[:n].astype(np.float64)
         v = particles.velocity.to_numpy()[:n].astype(np.float64)
-        density = (stage.density_ratio(scales)[identity] * fluid.state.rest_density).astype(
-            np.float64
-        )
+        ratio = self.features[:, 25].numpy().astype(np.float64)
+        density = ratio * fluid.state.rest_density
         i, j = _entries(nb.blood_count.to_numpy()[:n], nb.blood_index.to_numpy()[:n])
         r = x[i] - x[j]
         r2 = (r**2).sum(axis=1)
         near = r2 < kernel.support_radius**2
         i, j, r, r2 = i[near], j[near], r[near], r2[near]
-        slope = kernel.slope_of(np.sqrt(r2))
+        v_ij = v[i] - v[j]
+        slope = factors.mass * kernel.slope_of(np.sqrt(r2))
         eps = softening(kernel)
         self.i, self.j = torch.from_numpy(i), torch.from_numpy(j)
-        # a_i = sum_j push (P_i + P_j) + drag mu_ij, as `sum_acceleration`.
-        self.push = _f32((-factors.mass * factors.gradient * slope)[:, None] * r)
-        drag = 2.0 * factors.viscosity * factors.mass * slope * r2 / (r2 + eps)
-        self.drag = _f32((drag / (density[i] * density[j]))[:, None] * (v[i] - v[j]))
+        # a_i = known + sum_j push (P_i + P_j) + drag mu_ij, as `sum_acceleration`.
+        self.push = _f32((-factors.gradient * slope)[:, None] * r)
+        drag = 2.0 * factors.viscosity * slope * r2 / (r2 + eps)
+        self.drag = _f32((drag / (density[i] * density[j]))[:, None] * v_ij)
+        approach = np.minimum((v_ij * r).sum(axis=1), 0.0) / (r2 + eps)
+        damping = 2.0 * fluid.signal * slope * approach / (density[i] + density[j])
+        known = _sums(i, damping[:, None] * r, n)
         i, k = _entries(nb.wall_count.to_numpy()[:n], nb.wall_index.to_numpy()[:n])
         r = x[i] - stage.wall.position.to_numpy()[k]
         r2 = (r**2).sum(axis=1)
@@ -112,10 +137,19 @@ class Sample:
             * stage.wall.volume.to_numpy()[k]
             * kernel.slope_of(np.sqrt(r2))
         )
-        push = (-factors.wall_density * factors.gradient * share)[:, None] * r
+        self.wall_push = _f32(
+            _sums(i, (-factors.wall_density * factors.gradient * share)[:, None] * r, n)
+        )
         drag = 2.0 * factors.wall_friction * share * r2 / ((r2 + eps) * density[i] ** 2)
-        self.wall_push = _f32(np.stack([np.bincount(i, push[:, a], n) for a in range(3)], 1))
         self.wall_drag = _f32(np.bincount(i, drag, n)[:, None] * v)
+        approach = np.minimum((v[i] * r).sum(axis=1), 0.0) / (r2 + eps)
+        damping = factors.wall_density * share * fluid.signal * approach / density[i]
+        self.known = _f32(known + _sums(i, damping[:, None] * r, n))
+
+
+def _sums(i: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    """Sums of vectors by row, (n, 3)."""
+    return np.stack([np.bincount(i, values[:, a], n) for a in range(3)], 1)
 
 
 def _f32(a: np.ndarray) -> torch.Tensor:
@@ -132,38 +166,46 @@ class Model(torch.nn.Module):
     """The same network in torch, with the head's sums."""
 
     def __init__(self, training: Training, mean: np.ndarray, deviation: np.ndarray, scale: float):
-        """Make a network 23-5-5-5-3, or 25-5-5-5-2 for the pressure head."""
+        """Make a network 23-5-5-5-3, or with as many inputs as `training` names."""
         super().__init__()
         self.training_facts = training
-        direct = training.head == "direct"
-        sizes = (COUNT if direct else EXTENDED, *([WIDTH] * DEPTH), 3 if direct else 2)
+        self.columns = list(training.columns.index)
+        sizes = (len(self.columns), *([WIDTH] * DEPTH), 3)
         self.layers = torch.nn.ModuleList(
             torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)
         )
         self.mean = torch.from_numpy(mean.astype(np.float32))
         self.deviation = torch.from_numpy(deviation.astype(np.float32))
         self.scale = scale
+        if training.head == "pressure":
+            with torch.no_grad():  # begin half soft, half damped, as thin as at high shear
+                self.layers[-1].bias[:] = 0.0
 
     def outputs(self, features: torch.Tensor) -> torch.Tensor:
-        """Outputs of the network for dimensionless features (n, in)."""
-        y = ((features[:, : len(self.mean)] - self.mean) / self.deviation).clamp(-CLIP, CLIP)
+        """Outputs of the network for all features (n, 27)."""
+        y = ((features[:, self.columns] - self.mean) / self.deviation).clamp(-CLIP, CLIP)
         for layer in self.layers[:-1]:
-            y = torch.tanh(layer(y))
+            y = torch.nn.functional.softsign(layer(y))
         return self.layers[-1](y) * self.scale
 
-    def acceleration(self, sample: Sample, rest_density: float) -> torch.Tensor:
-        """Acceleration without gravity [m/s^2] of every particle of a sample."""
+    def acceleration(self, sample: Sample, rest_density: float, eta: float) -> torch.Tensor:
+        """Acceleration of every particle of a sample [m/s^2], gravity only if it was learned."""
         t = self.training_facts
         o = self.outputs(sample.features)
         if t.head == "direct":
             return o * (t.support_radius / t.frame_interval**2)
         speed = t.support_radius / t.frame_interval
-        p = torch.nn.functional.softplus(o[:, :1]) * (PRESSURE_FACTOR * speed**2 / rest_density)
-        mu = torch.sigmoid(o[:, 1:]) * (VISCOSITY_FACTOR * rest_density * t.support_radius * speed)
+        f = sample.features
+        excess = LARGEST_STIFFNESS * torch.sigmoid(o[:, 0]) * (f[:, 25] - 1.0)
+        excess = excess - LARGEST_DAMPING * torch.sigmoid(o[:, 1]) * f[:, 24]
+        p = excess.clamp(min=0.0) / f[:, 26].clamp(min=LEAST_RESPONSE)
+        p = p[:, None] * (speed**2 / rest_density)
+        bound = LARGEST_VISCOSITY * rest_density * t.support_radius * speed
+        mu = (eta * torch.exp(o[:, 2:].clamp(max=LARGEST_EXPONENT))).clamp(max=bound)
         mu_i, mu_j = mu[sample.i], mu[sample.j]
         pairs = sample.push * (p[sample.i] + p[sample.j])
         pairs = pairs + sample.drag * (2.0 * mu_i * mu_j / (mu_i + mu_j))
-        a = torch.zeros_like(sample.wall_push).index_add(0, sample.i, pairs)
+        a = sample.known.index_add(0, sample.i, pairs)
         return a + sample.wall_push * p + sample.wall_drag * mu
 
     def weights(self) -> Weights:
@@ -181,75 +223,135 @@ class Model(torch.nn.Module):
         )
 
 
-def _drive(stage: Stage, model: object, steps: int, interval: float) -> None:
-    """Take `steps` steps of the network from where the stage stands, and settle."""
-    stage.model, stage.step_limit = model, math.inf  # type: ignore[assignment]
-    for _ in range(steps):
-        stage.step(interval)
-    stage.settle()
+class Course:
+    """Recorded runs to learn from, some held out, and a stage for their frames."""
 
+    def __init__(self, file: Dataset, held_out: Sequence[int]):
+        """Set the stage for the largest run.
 
-def _put(stage: Stage, run: Run, frame: int) -> None:
-    """Put the stage into a recorded frame."""
-    stage.restore(run.state(frame), frame * run.facts.frame_interval, 0)
-    stage.set_acceleration(run.acceleration(frame))
+        Raises:
+            InputError: no such run, or no other.
+        """
+        self.runs, self.held = file.split(held_out)
+        facts = self.facts = self.runs[0].facts
+        largest = max((*self.runs, *self.held), key=lambda run: run.facts.particles)
+        self.scene = largest.scene
+        self.stage = Stage(self.scene, read_vessel(self.scene), largest.facts.seed)
+        self.physics: AccelerationModel = self.stage.model
+        self.interval = facts.frame_interval
+        ratio = self.scene.discretization.wall_spacing_ratio
+        self.scales = FeatureScales(
+            facts.support_radius, facts.spacing, self.interval, facts.sound_speed, ratio
+        )
 
+    def training(self, settings: Settings, command: str) -> Training:
+        """What a network trained here is to remember."""
+        facts, liquid = self.facts, proportions(self.stage.fluid)
+        return Training(
+            head=settings.head,
+            inputs=INPUTS[settings.head] if settings.inputs is None else settings.inputs,
+            spacing=facts.spacing,
+            support_radius=facts.support_radius,
+            frame_interval=self.interval,
+            substeps=facts.substeps,
+            sound_speed=facts.sound_speed,
+            wall_spacing_ratio=self.scales.wall_spacing_ratio,
+            artificial_viscosity=liquid["artificial_viscosity"],
+            thickening=liquid["thickening"],
+            correction=settings.correction,
+            seed=settings.seed,
+            scene=facts.scene_name,
+            scene_hash=hashlib.sha256(facts.scene.encode()).hexdigest(),
+            command=command,
+        )
 
-def _relabel(stage: Stage, physics: object, interval: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean acceleration [m/s^2] that the physics gives over the next interval, and where valid."""
-    before = stage.state()
-    stage.model, stage.step_limit = physics, stage.derived.step  # type: ignore[assignment]
-    stage.advance_to(stage.time + interval)
-    stage.settle()
-    after = stage.state()
-    target = (after.velocity.astype(np.float64) - before.velocity) / interval
-    return np.where(after.alive[:, None], target, 0.0), before.alive & after.alive
+    def pcnet(self, weights: Weights) -> PcNet:
+        """The network as `run` has it, without its guard: what dies here must be seen to die."""
+        net = PcNet(weights, self.stage.fluid, self.scales, self.stage.particles.capacity)
+        net.guarded = False
+        return net
 
+    def put(self, run: Run, frame: int) -> None:
+        """Put a recorded frame on the stage."""
+        self.stage.restore(run.state(frame), frame * self.interval, 0)
+        self.stage.set_acceleration(run.acceleration(frame))
 
-def rollout(stage: Stage, model: object, run: Run, frames: int | None = None) -> dict[str, float]:
-    """Roll a model out from the first frame of a recorded run and compare.
+    def drive(self, model: AccelerationModel, frames: int) -> None:
+        """Take steps of a frame each from where the stage stands, and settle.
 
-    Returns: survived (fraction of frames before it died: diverged or 99th percentile of
-    compression over 30 %), path_error (largest distance of the centres of mass over the recorded
-    path's length), drained_error (largest difference of the drained fraction), compression_p99.
-    """
-    interval = run.facts.frame_interval
-    frames = frames or len(run)
-    _put(stage, run, 0)
-    stage.model, stage.step_limit = model, math.inf  # type: ignore[assignment]
-    distance = length = drained = worst = 0.0
-    last = None
-    survived = 0
-    for frame in range(1, frames + 1):
-        alive = run.alive(frame)
-        try:
-            stage.step(interval)
-        except RunError:
-            break
-        n = stage.particles.count[None]
-        if not n or not alive.any():
-            survived = frames
-            break
-        density = stage.particles.density.to_numpy()[:n] / stage.fluid.state.rest_density
-        compression = float(np.percentile(np.maximum(density - 1.0, 0.0), 99))
-        worst = max(worst, compression)
-        if not compression < 0.3:
-            break
-        survived = frame
-        centre = run.position(frame)[alive].mean(axis=0)
-        here = stage.particles.position.to_numpy()[:n].mean(axis=0)
-        # Few drops say little of a centre of mass.
-        if alive.mean() > 0.2:
-            length += float(np.linalg.norm(centre - last)) if last is not None else 0.0
-            distance = max(distance, float(np.linalg.norm(here - centre)))
-        last = centre
-        drained = max(drained, abs(n / len(alive) - float(alive.mean())))
-    return {
-        "survived": survived / frames,
-        "path_error": distance / max(length, 1e-9),
-        "drained_error": drained,
-        "compression_p99": worst,
-    }
+        Raises:
+            RunError: it diverged.
+        """
+        self.stage.model, self.stage.step_limit = model, math.inf
+        for _ in range(frames):
+            self.stage.step(self.interval)
+        self.stage.settle()
+
+    def relabel(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean acceleration [m/s^2] of the physics over the next frame, and where it is valid."""
+        stage = self.stage
+        before = stage.state()
+        stage.model, stage.step_limit = self.physics, stage.derived.step
+        stage.advance_to(stage.time + self.interval)
+        stage.settle()
+        after = stage.state()
+        target = (after.velocity.astype(np.float64) - before.velocity) / self.interval
+        return np.where(after.alive[:, None], target, 0.0), before.alive & after.alive
+
+    def examples(self, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        """Features (n, 27) and targets [m/s^2] (n, 3) from frames all over the training runs."""
+        inputs, targets = [], []
+        for run in self.runs:
+            for frame in np.linspace(1, len(run) - 1, frames).astype(int):
+                self.put(run, int(frame))
+                valid = run.has_target(int(frame))
+                inputs.append(self.stage.features(self.scales)[: len(valid)][valid])
+                targets.append(run.target(int(frame))[valid])
+        return np.concatenate(inputs), np.concatenate(targets)
+
+    def rollout(self, model: AccelerationModel, run: Run) -> dict[str, float]:
+        """Roll a model out from the first frame of a run and compare.
+
+        Returns: survived (fraction of frames before it died: diverged, or compression beyond DIED),
+        path_error (largest distance of the centres of mass over the recorded path's length, while
+        a fifth of the blood is there), drained_error (largest difference of the drained fraction),
+        compression_p99 (largest).
+        """
+        stage, frames = self.stage, len(run)
+        self.put(run, 0)
+        stage.model, stage.step_limit = model, math.inf
+        distance = length = drained = worst = 0.0
+        last = None
+        survived = 0
+        for frame in range(1, frames + 1):
+            alive = run.alive(frame)
+            try:
+                stage.step(self.interval)
+            except RunError:
+                break
+            n = stage.particles.count[None]
+            if not n or not alive.any():
+                survived = frames
+                break
+            density = stage.particles.density.to_numpy()[:n] / stage.fluid.state.rest_density
+            compression = float(np.percentile(np.maximum(density - 1.0, 0.0), 99))
+            worst = max(worst, compression)
+            if not compression < DIED:
+                break
+            survived = frame
+            centre = run.position(frame)[alive].mean(axis=0)
+            here = stage.particles.position.to_numpy()[:n].mean(axis=0)
+            if alive.mean() > 0.2:
+                length += float(np.linalg.norm(centre - last)) if last is not None else 0.0
+                distance = max(distance, float(np.linalg.norm(here - centre)))
+            last = centre
+            drained = max(drained, abs(n / len(alive) - float(alive.mean())))
+        return {
+            "survived": survived / frames,
+            "path_error": distance / max(length, 1e-9),
+            "drained_error": drained,
+            "compression_p99": worst,
+        }
 
 
 def score_of(figures: dict[str, float]) -> float:
@@ -258,137 +360,191 @@ def score_of(figures: dict[str, float]) -> float:
     return figures["survived"] - min(1.0, wrong)
 
 
+@dataclass
+class Progress:
+    """Where a training stands; all that a resumed one needs beside the network's tensors."""
+
+    iteration: int = 0
+    best: float = -math.inf
+    seconds: float = 0.0
+    """Wall time so far [s]."""
+    history: list[dict[str, float]] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    """Since the last validation."""
+
+
 def train_weights(
     data: Path,
     out: Path,
     settings: Settings,
-    held_out: int,
+    held_out: Sequence[int],
     command: str = "",
-    report: Callable[[str], None] = print,
-) -> Weights:
-    """Train on all runs of a file but one, which chooses the weights; writes `out`.
+    report: Callable[[Progress], None] = print,
+) -> tuple[Weights, list[dict[str, float]]]:
+    """Train on all runs of a file that are not held out; writes `out`.
+
+    The first run held out chooses the weights; nothing looks at the others.
+    A training that was cut short goes on from its checkpoint beside `out`, and ends with the same
+    weights as one that was not.
+
+    Returns:
+        the weights, and the figures of every validation.
 
     Raises:
-        InputError: no such run, or fewer than two.
+        InputError: no such run, or none left to train on; or a checkpoint of another training.
     """
     torch.manual_seed(settings.seed)
     generator = np.random.default_rng(settings.seed)
-    begin = time.perf_counter()
+    began = time.perf_counter()
     with Dataset(data) as file:
-        runs, (held,) = file.split([held_out])
-        if not runs:
-            raise InputError(f"{data}: has one run; training needs one more than it holds out")
-        largest = max((*runs, held), key=lambda run: run.facts.particles)
-        scene = largest.scene
-        stage = Stage(scene, read_vessel(scene), largest.facts.seed)
-        facts, fluid = held.facts, stage.fluid
-        interval = facts.frame_interval
-        physics = stage.model
-        direct = settings.head == "direct"
-        training = Training(
-            head=settings.head,
-            spacing=facts.spacing,
-            support_radius=facts.support_radius,
-            frame_interval=interval,
-            substeps=facts.substeps,
-            sound_speed=facts.sound_speed,
-            wall_spacing_ratio=scene.discretization.wall_spacing_ratio,
-            correction=settings.correction,
-            seed=settings.seed,
-            scene=facts.scene_name,
-            scene_hash=hashlib.sha256(facts.scene.encode()).hexdigest(),
-            command=command,
+        course = Course(file, held_out)
+        fluid, direct = course.stage.fluid, settings.head == "direct"
+        density, eta = fluid.state.rest_density, fluid.rheology.eta
+        training = course.training(settings, command)
+        # Gravity joins the pressure head's sums; the direct head learns it or nothing does.
+        gravity = torch.tensor((0.0, 0.0, 0.0) if direct else course.scene.gravity)
+        features, wanted = course.examples(16)
+        seen = features[:, training.columns.index]
+        typical = float((wanted - gravity.numpy()).std())
+        unit = course.scales.acceleration
+        model = Model(
+            training,
+            seen.mean(axis=0),
+            np.maximum(seen.std(axis=0), DEVIATION_FLOOR),
+            typical / unit if direct else 1.0,
         )
-        scales = FeatureScales(facts.support_radius, facts.spacing, interval, facts.sound_speed)
-        gravity = torch.tensor(() if direct else scene.gravity, dtype=torch.float32)
-
-        # What inputs and targets are like, from frames all over the training runs.
-        inputs, targets = [], []
-        for run in runs:
-            for frame in np.linspace(1, len(run) - 1, 16).astype(int):
-                _put(stage, run, int(frame))
-                valid = run.has_target(int(frame))
-                inputs.append(stage.features(scales)[: len(valid)][valid])
-                targets.append(run.target(int(frame))[valid])
-        everything = np.concatenate(inputs)
-        wanted = np.concatenate(targets) - (0.0 if direct else np.asarray(scene.gravity))
-        width = COUNT if direct else EXTENDED
-        mean = everything[:, :width].mean(axis=0)
-        deviation = np.maximum(everything[:, :width].std(axis=0), DEVIATION_FLOOR)
-        typical = float(wanted.std())
-        unit = facts.support_radius / interval**2
-        model = Model(training, mean, deviation, typical / unit if direct else 1.0)
-        if not direct:
-            with torch.no_grad():  # begin with next to no pressure and little viscosity
-                model.layers[-1].bias[:] = torch.tensor([-3.0, -5.0])
         optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.iterations)
-        net = PcNet(model.weights(), fluid, stage.particles.capacity)
-        best: tuple[float, Weights] | None = None
-        history = []
-        losses: list[float] = []
-        physics_loss = torch.nn.HuberLoss(delta=1.0)
+        net = course.pcnet(model.weights())
+        huber = torch.nn.HuberLoss(delta=1.0)
+        parts = {"model": model, "optimiser": optimiser, "schedule": schedule}
+        identity = {
+            **asdict(settings),
+            "held_out": list(held_out),
+            "scene_hash": training.scene_hash,
+        }
+        identity |= {"frame_interval": course.interval, "runs": len(course.runs)}
+        checkpoint = out.with_name(out.name + ".checkpoint")
+        at = _resume(checkpoint, identity, parts, generator) or Progress()
+        before = at.seconds
 
-        for iteration in range(1, settings.iterations + 1):
-            run = runs[generator.integers(len(runs))]
-            correct = settings.correction != "bp" and iteration % PERIOD == 0
-            if settings.correction == "relabel":
-                # As many drifted samples as recorded ones, and drifts that grow.
-                correct = iteration % 2 == 0
-                reach = 1 + int(settings.drift * min(1.0, 2.0 * iteration / settings.iterations))
-                drift = int(generator.integers(1, reach + 1))
-            else:
-                drift = PERIOD
-            frame = int(generator.integers(0, len(run) - drift))
-            _put(stage, run, frame)
-            try:
-                if correct:
-                    net.network.load(model.weights())
-                    _drive(stage, net, drift, interval)
-                frame += drift if correct else 0
-                valid = run.has_target(frame)
-                sample = Sample(stage, scales, run.target(frame), valid, pairs=not direct)
-                if correct and settings.correction == "relabel":
-                    rows = stage.particles.identity.to_numpy()[: stage.particles.count[None]]
-                    target, valid = _relabel(stage, physics, interval)
-                    sample.target = _f32(target[rows])
-                    sample.valid = torch.from_numpy(valid[rows])
-            except RunError:
-                continue  # drifted beyond what the simulator bears: nothing to learn there
-            if not sample.valid.any():
-                continue
-            error = model.acceleration(sample, fluid.state.rest_density) - sample.target
-            error = (error + (0.0 if direct else gravity))[sample.valid] / typical
-            if direct and len(error) > settings.batch:
-                error = error[torch.randperm(len(error))[: settings.batch]]
-            loss = physics_loss(error, torch.zeros_like(error))
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimiser.step()
+        while at.iteration < settings.iterations:
+            at.iteration += 1
+            sample = _draw(course, settings, at.iteration, generator, net, model)
+            if sample is not None:
+                error = model.acceleration(sample, density, eta) - sample.target
+                error = (error + gravity)[sample.valid] / typical
+                if direct and len(error) > settings.batch:
+                    error = error[torch.randperm(len(error))[: settings.batch]]
+                loss = huber(error, torch.zeros_like(error))
+                optimiser.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+                optimiser.step()
+                at.losses.append(float(loss.detach()))
             schedule.step()
-            losses.append(float(loss.detach()))
-            late = time.perf_counter() - begin > 60.0 * settings.minutes
-            if iteration % settings.validate_every == 0 or late or iteration == settings.iterations:
-                weights = model.weights()
-                net.network.load(weights)
-                figures = rollout(stage, net, held)
-                score = score_of(figures)
-                history.append({"iteration": iteration, "loss": float(np.mean(losses)), **figures})
-                losses = []
-                report(
-                    f"{iteration:6d}  loss {history[-1]['loss']:.4f}  "
-                    + "  ".join(f"{k} {v:.3f}" for k, v in figures.items())
-                    + f"  {time.perf_counter() - begin:.0f} s"
-                )
-                if best is None or score > best[0]:
-                    best = score, replace(weights, training=replace(training, validation=figures))
-                    best[1].save(out)
-                out.with_suffix(".history.json").write_text(json.dumps(history, indent=1))
-            if late:
-                break
-    assert best is not None
-    return best[1]
+            if at.iteration % settings.validate_every and at.iteration < settings.iterations:
+                continue
+            weights = model.weights()
+            net.network.load(weights)
+            figures = course.rollout(net, course.held[0])
+            mean = float(np.mean(at.losses)) if at.losses else math.nan
+            at.history.append({"iteration": at.iteration, "loss": mean, **figures})
+            at.losses.clear()
+            if score_of(figures) > at.best:
+                at.best = score_of(figures)
+                replace(weights, training=replace(training, validation=figures)).save(out)
+            at.seconds = before + time.perf_counter() - began
+            _save(checkpoint, identity, parts, generator, at)
+            report(at)
+    checkpoint.unlink(missing_ok=True)
+    return Weights.load(out), at.history
 
 
-__all__ = ["Settings", "rollout", "train_weights"]
+def _draw(
+    course: Course,
+    settings: Settings,
+    iteration: int,
+    generator: np.random.Generator,
+    net: PcNet,
+    model: Model,
+) -> Sample | None:
+    """The sample of a gradient step; None if the network drifted beyond what can be simulated."""
+    run = course.runs[generator.integers(len(course.runs))]
+    correct = settings.correction == "periodic" and iteration % PERIOD == 0
+    drift = PERIOD
+    if settings.correction == "relabel":
+        # As many drifted samples as recorded ones, and drifts that grow.
+        correct = iteration % 2 == 0
+        reach = 1 + int(settings.drift * min(1.0, 2.0 * iteration / settings.iterations))
+        drift = int(generator.integers(1, reach + 1))
+    frame = int(generator.integers(0, max(1, len(run) - drift)))
+    course.put(run, frame)
+    try:
+        if correct:
+            net.network.load(model.weights())
+            course.drive(net, min(drift, len(run) - 1 - frame))
+            frame = min(frame + drift, len(run) - 1)
+        sample = Sample(
+            course.stage, course.scales, run.target(frame), run.has_target(frame),
+            pairs=settings.head != "direct",
+        )  # fmt: skip
+        if correct and settings.correction == "relabel":
+            rows = sample.identity
+            target, valid = course.relabel()
+            sample.target, sample.valid = _f32(target[rows]), torch.from_numpy(valid[rows])
+    except RunError:
+        return None
+    return sample if sample.valid.any() else None
+
+
+def _save(
+    path: Path,
+    identity: dict[str, Any],
+    parts: dict[str, Any],
+    generator: np.random.Generator,
+    at: Progress,
+) -> None:
+    """Write a checkpoint, atomically."""
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("wb") as file:
+        torch.save(
+            {
+                "identity": identity,
+                "parts": {name: part.state_dict() for name, part in parts.items()},
+                "generator": generator.bit_generator.state,
+                "torch": torch.get_rng_state(),
+                "progress": asdict(at),
+            },
+            file,
+        )
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def _resume(
+    path: Path, identity: dict[str, Any], parts: dict[str, Any], generator: np.random.Generator
+) -> Progress | None:
+    """Go on from a checkpoint, if there is one.
+
+    Raises:
+        InputError: it cannot be read, or is another training's.
+    """
+    if not path.exists():
+        return None
+    try:
+        found = torch.load(path, weights_only=True)
+    except Exception as error:  # torch names no errors of its own
+        raise InputError(f"{path}: not a checkpoint, or a cut one ({error}); delete it") from None
+    for name, value in identity.items():
+        if found["identity"].get(name) != value:
+            raise InputError(
+                f"{path}: holds a training with {name} {found['identity'].get(name)}, asked for is "
+                f"{value}; delete it, or train the same to go on"
+            )
+    for name, part in parts.items():
+        part.load_state_dict(found["parts"][name])
+    generator.bit_generator.state = found["generator"]
+    torch.set_rng_state(found["torch"])
+    return Progress(**found["progress"])

@@ -26,6 +26,8 @@ class AccelerationModel(Protocol):
 
     name: str
     """Short name for summaries."""
+    fell_back: bool
+    """Whether the last acceleration is the physics', since the model did not trust itself."""
 
     def accelerate(
         self,
@@ -75,6 +77,7 @@ class SphAcceleration:
     """Weakly compressible SPH with Casson blood and wall coupling."""
 
     name = "physics"
+    fell_back = False
 
     def __init__(self, fluid: Fluid, capacity: int):
         """Make the scratch fields for `capacity` particles."""

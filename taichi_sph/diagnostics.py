@@ -31,6 +31,8 @@ class Diagnostics:
     """Sum of m v^2/2 [J]."""
     max_speed: float
     """Largest speed [m/s]."""
+    fallback_share: float
+    """Part of the simulated time in which the model fell back to the physics."""
 
 
 def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]:

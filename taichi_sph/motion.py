@@ -40,6 +40,8 @@ class Motion:
         self.steps = 0
         self.last_step = 0.0
         self.wall_corrections = 0
+        self.fallback_time = 0.0
+        """Simulated time for which the model fell back to the physics [s]."""
         self.step_limit = math.inf
         """Longest step allowed beside the model's own limit [s]."""
         self._stale = True
@@ -67,6 +69,7 @@ class Motion:
         self._stale = 4.0 * moved2 > self.neighbors.skin**2
         self.wall_corrections += int(corrected)
         self.last_step = dt
+        self.fallback_time += dt * self.model.fell_back
         self.time += dt
         self.steps += 1
 

@@ -4,6 +4,8 @@ Taichi frees no field and compiles every kernel anew for new fields or constants
 tests put their own particles on one of three stages instead of allocating.
 """
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -90,6 +92,7 @@ class Prescribed:
     law: Callable[[np.ndarray], np.ndarray]
     step: float
     name: str = "prescribed"
+    fell_back: bool = False
 
     def accelerate(self, particles, wall, neighbors, gravity) -> None:
         """Write the law's acceleration and the rest density."""
@@ -258,3 +261,9 @@ def ball(generator: np.random.Generator, radius: float, amplitude: float = 0.3) 
     x = cubic_lattice(12, 12, 12) - 6.0 * D
     x = x[np.linalg.norm(x, axis=1) < radius - amplitude * D]
     return x + amplitude * D * generator.uniform(-0.577, 0.577, x.shape)
+
+
+def vesselflow(*arguments: object) -> str:
+    """Standard output of the command, which must succeed."""
+    command = [sys.executable, "-m", "app", *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -5,8 +5,11 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
+from pathlib import Path
+
 import pytest
 
+from builders import vesselflow
 from taichi_sph.runtime import start
 
 
@@ -31,3 +34,18 @@ def precision(request: pytest.FixtureRequest) -> str:
 def rtol(precision: str) -> float:
     """Relative rounding error of a sum of some tens of terms."""
     return {"f64": 1e-12, "f32": 2e-5}[precision]
+
+
+@pytest.fixture(scope="session")
+def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a coarse box scene, blood that stands in it, and three recorded columns."""
+    shipped = Path(__file__).parent.parent / "assets" / "vessels" / "box"
+    folder = tmp_path_factory.mktemp("box")
+    (folder / "lumen.ply").write_bytes((shipped / "lumen.ply").read_bytes())
+    text = (shipped / "scene.toml").read_text()
+    coarse = text.replace("spacing = 0.001 ", "spacing = 0.002 ")
+    assert coarse != text
+    (folder / "scene.toml").write_text(coarse)
+    vesselflow("record", folder, "--heights", "0.012,0.020,0.016", "--frames", "60",
+               "--substeps", "4", "--out", folder / "data.h5")  # fmt: skip
+    return folder

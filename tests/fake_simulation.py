@@ -70,6 +70,7 @@ class FakeSimulation:
             leaks=int(self.time > 0.0),
             wall_corrections=self.steps,
             compression_p99=0.01,
+            fallback_share=0.0,
             compression_max=0.02,
             kinetic_energy=0.5,
             max_speed=1.0,

@@ -4,10 +4,22 @@ import numpy as np
 import pytest
 from taichi import ndarray
 
-from builders import DENSITY, SPHERE, D, R, Stage, ball, make_fluid, number, precision, sphere
+from builders import (
+    DENSITY,
+    SPHERE,
+    WALL_SPACING,
+    D,
+    R,
+    Stage,
+    ball,
+    make_fluid,
+    number,
+    precision,
+    sphere,
+)
 from nn.features import BINS, COUNT, EXTENDED, NAMES, FeatureScales, extract
 
-SCALES = FeatureScales(R, D, 4e-4, 2.0)
+SCALES = FeatureScales(R, D, 4e-4, 2.0, WALL_SPACING / D)
 FLUID = make_fluid()
 CLOSE = {"f64": 1e-10, "f32": 1e-5}
 """Of each feature's largest value; single precision has seven digits."""
@@ -52,7 +64,7 @@ def features_of(x, v, a, y) -> tuple[np.ndarray, np.ndarray]:
         r, q = r[q < 1.0], q[q < 1.0]
         edges.append(q)
         if len(q):
-            f[16] = len(q) / SCALES.neighbours
+            f[16] = len(q) / SCALES.proxies
             f[17:20], f[20] = r.mean(axis=0), q.var()
             f[21], f[22] = shape(q)
         values = np.concatenate(edges) * BINS
@@ -76,8 +88,8 @@ def cloud(seed: int) -> Stage:
 
 
 def extracted(stage: Stage) -> np.ndarray:
-    """What the kernel finds, by identity, (n, 26)."""
-    out = ndarray(float, (stage.particles.capacity, EXTENDED + 1))
+    """What the kernel finds, by identity, (n, 27)."""
+    out = ndarray(float, (stage.particles.capacity, EXTENDED + 2))
     extract(stage.particles, stage.wall, stage.neighbors, FLUID, SCALES, out)
     return out.to_numpy()[: stage.particles.count[None]]
 
@@ -106,6 +118,31 @@ def test_density_beside_the_features_is_equation_2():
     np.testing.assert_allclose(
         found[:, COUNT], 50.0 * np.maximum(density - 1.0, 0.0), atol=5e3 * CLOSE[precision()]
     )
+
+
+def test_response_is_what_a_particles_own_pressure_does_to_its_density():
+    stage = cloud(4)
+    fluid = stage.reference(FLUID)
+    found = extracted(stage)[:, EXTENDED + 1]
+    blood = fluid.spacing_volume * fluid.grad
+    wall = FLUID.calibration.wall_density * fluid.volume[:, None] * fluid.grad_wall
+    whole = blood.sum(axis=1) + wall.sum(axis=1)
+    # A pressure of i moves i by -whole_i and each j by blood_ij; the density of i answers with
+    # whole_i . (its own way) - sum_j blood_ij . (j's way).
+    change = -(whole**2).sum(axis=1) - (blood**2).sum(axis=(1, 2))
+    np.testing.assert_allclose(found, -change * R**2, rtol=20.0 * CLOSE[precision()])
+
+
+def test_features_do_not_depend_on_the_unit_of_length():
+    """A vessel twice as large whose sound needs twice the time to cross a neighbourhood."""
+    double = FeatureScales(
+        2.0 * R, 2.0 * D, 2.0 * SCALES.frame_interval, SCALES.sound_speed, WALL_SPACING / D
+    )
+    assert double.speed == SCALES.speed
+    assert double.neighbours == SCALES.neighbours
+    assert double.proxies == SCALES.proxies
+    assert double.speed_limit == SCALES.speed_limit
+    assert double.acceleration == 0.5 * SCALES.acceleration
 
 
 def test_divergence_is_the_rate_at_which_density_falls():

@@ -1,5 +1,6 @@
 import itertools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ from builders import (
     BOX,
     CAPACITY,
     SKIN,
+    SPHERE,
+    WALL_SPACING,
     D,
     R,
     Stage,
+    ball,
     jittered_lattice,
     make_fluid,
     number,
@@ -21,7 +25,7 @@ from builders import (
 )
 from reference import proxy_volumes, separations
 from taichi_sph.errors import RunError
-from taichi_sph.neighbors import list_capacity, make_grid
+from taichi_sph.neighbors import Neighbors, cells_within, list_capacity, make_grid
 from taichi_sph.rheology import Casson
 
 ROUNDING = {"f64": 1e-12, "f32": 1e-5}
@@ -104,6 +108,51 @@ def test_lists_are_what_brute_force_finds(name, seed):
     blood, wall = matrices(stage)
     assert blood.any() and (wall.any() or stage.wall.count == 0)
     assert_lists_are_brute_force(stage)
+
+
+def test_cells_away_from_the_vessel_change_no_list():
+    stage = sphere()
+    whole = stage.neighbors
+    # Small cells, so that blocks of them are smaller than the round vessel.
+    grid = make_grid(np.full(3, -20 * D), np.full(3, 25 * D), REACH / 2)
+    fine = replace(grid, reach=2 * grid.reach)
+    used = cells_within(fine, lambda x: np.linalg.norm(x, axis=1) - SPHERE, 3.0 * D)
+    assert used.mean() < 0.3
+    corner = np.argwhere(used.reshape(fine.shape)) * np.array(fine.cell) + np.array(fine.lower)
+    for axis in range(3):  # the vessel and its margin, to within a cell
+        assert corner[:, axis].min() <= -SPHERE - 3.0 * D
+        assert corner[:, axis].max() >= SPHERE + 3.0 * D - fine.cell[axis]
+    few = Neighbors.allocate(fine, R, SKIN, CAPACITY, D, WALL_SPACING, used)
+    stage.put(ball(np.random.default_rng(5), SPHERE - 0.2 * D))
+    stage.build()
+    particles = stage.particles
+    x = stage.in_order(particles.position)
+    expected = [set(row) for row in by_identity(stage, whole)]
+    few.sort_wall(stage.wall)
+    few.build(particles, stage.wall)
+    np.testing.assert_array_equal(stage.in_order(particles.position), x)
+    assert [set(row) for row in by_identity(stage, few)] == expected
+    walls = few.wall_count.to_numpy()[: len(x)]
+    # A stray beyond all cells in use is found by nobody, and spoils nothing.
+    stray = np.vstack([x, [[24 * D, 24 * D, 24 * D], [-19 * D, 0.0, 0.0]]])
+    stage.put(stray)
+    few.build(particles, stage.wall)
+    lists = by_identity(stage, few)
+    assert [set(row) for row in lists[: len(x)]] == expected
+    assert lists[len(x) :] == [[], []]
+    assert few.wall_count.to_numpy()[: len(stray)].sum() == walls.sum()
+    stage.neighbors.sort_wall(stage.wall)
+
+
+def by_identity(stage: Stage, neighbors: Neighbors) -> list[list[int]]:
+    """Identities on each particle's list, by identity."""
+    n = stage.particles.count[None]
+    name = stage.particles.identity.to_numpy()[:n]
+    count, index = neighbors.blood_count.to_numpy(), neighbors.blood_index.to_numpy()
+    lists: list[list[int]] = [[] for _ in range(n)]
+    for row in range(n):
+        lists[name[row]] = sorted(name[index[row, : count[row]]].tolist())
+    return lists
 
 
 def test_blood_that_has_left_the_box_still_finds_its_neighbours():

@@ -1,6 +1,7 @@
 """PcNet's kernels against numpy and torch, and its weights file."""
 
 import json
+import shutil
 import subprocess
 import sys
 from itertools import pairwise
@@ -9,11 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from builders import D, R, jittered_lattice, make_fluid, periodic, precision
-from nn.features import COUNT, EXTENDED
-from nn.pcnet import PRESSURE_FACTOR, VISCOSITY_FACTOR, PcNet
+from builders import DENSITY, D, R, jittered_lattice, make_fluid, periodic, precision
+from nn.features import COUNT, EXTENDED, NAMES
+from nn.pcnet import (
+    LARGEST_ADVANCE,
+    LARGEST_DAMPING,
+    LARGEST_STIFFNESS,
+    LARGEST_VISCOSITY,
+    LEAST_RESPONSE,
+    PcNet,
+)
 from nn.weights import Training, Weights, require_fit
+from reference import wendland_gradient
 from taichi_sph.errors import InputError
+from taichi_sph.rheology import Newtonian
 from test_features import SCALES, cloud, extracted
 
 CLOSE = {"f64": 1e-6, "f32": 1e-5}
@@ -26,7 +36,7 @@ FLUID = make_fluid()
 def weights(head: str, seed: int = 0) -> Weights:
     """A random network of the paper's size."""
     generator = np.random.default_rng(seed)
-    sizes = (COUNT, 5, 5, 5, 3) if head == "direct" else (EXTENDED, 5, 5, 5, 2)
+    sizes = (COUNT, 5, 5, 5, 3) if head == "direct" else (EXTENDED, 5, 5, 5, 3)
     layers = tuple(
         (
             generator.normal(size=(b, a)).astype(np.float32) / np.float32(np.sqrt(a)),
@@ -35,7 +45,20 @@ def weights(head: str, seed: int = 0) -> Weights:
         for a, b in pairwise(sizes)
     )
     training = Training(
-        head, D, R, SCALES.frame_interval, 4, SCALES.sound_speed, 1.0, "bp", 0, "tube", "0" * 64
+        head=head,
+        inputs=NAMES[: sizes[0]],
+        spacing=D,
+        support_radius=R,
+        frame_interval=SCALES.frame_interval,
+        substeps=4,
+        sound_speed=SCALES.sound_speed,
+        wall_spacing_ratio=1.0,
+        artificial_viscosity=0.05,
+        thickening=17.3,
+        correction="bp",
+        seed=0,
+        scene="tube",
+        scene_hash="0" * 64,
     )
     return Weights(
         layers,
@@ -46,29 +69,46 @@ def weights(head: str, seed: int = 0) -> Weights:
     )
 
 
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """1/(1 + exp(-x))."""
+    return 1.0 / (1.0 + np.exp(-x))
+
+
 def test_the_direct_head_is_the_network_of_the_features():
     stage = cloud(5)
     w = weights("direct")
     f = extracted(stage)
     expected = w.evaluate(f[:, :COUNT]) * SCALES.acceleration
-    net = PcNet(w, FLUID, stage.particles.capacity)
+    net = PcNet(w, FLUID, SCALES, stage.particles.capacity)
+    net.guarded = False
     net.accelerate(stage.particles, stage.wall, stage.neighbors, GRAVITY)
     found = stage.in_order(stage.particles.acceleration)
     assert np.abs(found - expected).max() < CLOSE[precision()] * np.abs(expected).max()
 
 
-def test_the_pressure_head_gives_two_numbers_that_are_not_negative():
+def test_the_pressure_head_gives_numbers_that_are_not_negative():
     stage = cloud(6)
     w = weights("pressure")
     f = extracted(stage)
     o = w.evaluate(f[:, :EXTENDED])
-    net = PcNet(w, FLUID, stage.particles.capacity)
+    # So thick that half of the viscosities meet their bound.
+    bound = LARGEST_VISCOSITY * DENSITY * R**2 / SCALES.frame_interval
+    fluid = make_fluid(rheology=Newtonian(float(bound / np.exp(np.median(o[:, 2])))))
+    net = PcNet(w, fluid, SCALES, stage.particles.capacity)
+    net.guarded = False
     net.accelerate(stage.particles, stage.wall, stage.neighbors, GRAVITY)
     speed = R / SCALES.frame_interval
     density = FLUID.state.rest_density
-    pressure = PRESSURE_FACTOR * speed**2 / density * np.log1p(np.exp(o[:, 0]))
-    viscosity = VISCOSITY_FACTOR * density * R * speed / (1.0 + np.exp(-o[:, 1]))
-    for field, expected in ((net.pressure_term, pressure), (net.viscosity, viscosity)):
+    excess = LARGEST_STIFFNESS * sigmoid(o[:, 0]) * (f[:, 25] - 1.0)
+    excess -= LARGEST_DAMPING * sigmoid(o[:, 1]) * f[:, 24]
+    pressure = speed**2 / density * np.maximum(excess, 0.0) / np.maximum(f[:, 26], LEAST_RESPONSE)
+    assert 0.1 < np.mean(pressure > 0.0) < 0.9
+    viscosity = np.minimum(fluid.rheology.eta * np.exp(o[:, 2]), bound)
+    assert 0.1 < np.mean(viscosity < bound) < 0.9
+    for field, expected in (
+        (net.physics.pressure_term, pressure),
+        (net.physics.viscosity, viscosity),
+    ):
         found = stage.in_order(field)
         assert found.min() >= 0.0
         assert np.abs(found - expected).max() < CLOSE[precision()] * expected.max()
@@ -80,12 +120,69 @@ def test_the_pressure_head_conserves_momentum_whatever_its_weights():
     x = jittered_lattice(generator)
     stage.put(x, 0.03 * generator.normal(size=x.shape))
     stage.build()
-    net = PcNet(weights("pressure", seed=4), FLUID, stage.particles.capacity)
+    fluid = make_fluid(rheology=Newtonian(3.5e-3))
+    net = PcNet(weights("pressure", seed=4), fluid, SCALES, stage.particles.capacity)
+    net.guarded = False
     net.accelerate(stage.particles, stage.wall, stage.neighbors, (0.0, 0.0, 0.0))
     a = stage.in_order(stage.particles.acceleration)
     magnitude = np.linalg.norm(a, axis=1).sum()
     assert magnitude > 0.0
     assert np.abs(a.sum(axis=0)).max() < {"f64": 1e-13, "f32": 2e-6}[precision()] * magnitude
+
+
+def test_a_step_of_the_pressure_head_is_stable_whatever_its_weights():
+    """k lambda + 2 g lambda < 4, lambda the largest eigenvalue of v -> D^-1 grad div v."""
+    factors = FLUID.calibration
+    largest = []
+    for disorder in (0.0, 0.1, 0.2, 0.3):
+        generator = np.random.default_rng(8)
+        n = 8
+        lattice = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        x = (lattice + disorder * generator.normal(size=lattice.shape)) * D
+        r = x[:, None] - x[None]
+        r -= n * D * np.round(r / (n * D))
+        g = factors.mass / DENSITY * wendland_gradient(r, R)  # none of a particle with itself
+        response = (g.sum(axis=1) ** 2).sum(axis=1) + (g**2).sum(axis=(1, 2))
+        response = np.maximum(response, LEAST_RESPONSE / R**2)
+        v = generator.normal(size=x.shape)
+        for _ in range(200):
+            rate = np.einsum("ija,ia->i", g, v) - np.einsum("ija,ja->i", g, v)
+            p = rate / response
+            a = -factors.gradient * np.einsum("ija,ij->ia", g, p[:, None] + p[None])
+            growth = -(a * v).sum() / (v**2).sum()
+            v = a / np.linalg.norm(a)
+        largest.append(growth)
+    assert min(largest) > 2.0
+    assert (LARGEST_STIFFNESS + 2.0 * LARGEST_DAMPING) * max(largest) < 4.0
+
+
+def test_the_step_shortens_for_blood_faster_than_any_in_training():
+    net = PcNet(weights("pressure"), FLUID, SCALES, 8)
+    assert net.stable_step(0.1 * SCALES.speed_limit, 1e9) == SCALES.frame_interval
+    fast = 4.0 * SCALES.speed_limit
+    assert net.stable_step(fast, 1e9) * fast == pytest.approx(LARGEST_ADVANCE * R, rel=1e-12)
+
+
+def test_the_physics_takes_over_from_a_direct_head_that_lets_blood_collapse():
+    stage = cloud(9)
+    fluid = make_fluid(rheology=Newtonian(3.5e-3))
+    net = PcNet(weights("direct"), fluid, SCALES, stage.particles.capacity)
+    step = stage.particles, stage.wall, stage.neighbors, GRAVITY
+    x, v = (stage.in_order(f) for f in (stage.particles.position, stage.particles.velocity))
+    stage.put(x[::3], v[::3])
+    stage.build()
+    net.accelerate(*step)
+    assert not net.fell_back
+    assert net.stable_step(1e-9, 1.0) == SCALES.frame_interval
+    # All of it, a tenth closer: a third denser.
+    stage.put(0.9 * x, v)
+    stage.build()
+    net.accelerate(*step)
+    assert net.fell_back
+    found = stage.in_order(stage.particles.acceleration)
+    expected = stage.reference(fluid).acceleration(np.asarray(GRAVITY))
+    assert np.abs(found - expected).max() < CLOSE[precision()] * np.abs(expected).max()
+    assert net.stable_step(1.0, 1.0) == net.physics.stable_step(1.0, 1.0)
 
 
 def test_the_network_is_the_one_that_torch_trains():
@@ -99,7 +196,7 @@ def test_the_network_is_the_one_that_torch_trains():
     )
     for k, (weight, bias) in enumerate(w.layers):
         y = torch.nn.functional.linear(y, torch.from_numpy(weight), torch.from_numpy(bias))
-        y = torch.tanh(y) if k + 1 < len(w.layers) else y
+        y = torch.nn.functional.softsign(y) if k + 1 < len(w.layers) else y
     np.testing.assert_allclose(w.evaluate(x), 0.3 * y.numpy(), rtol=1e-5, atol=1e-5)
 
 
@@ -108,7 +205,7 @@ def test_weights_survive_the_file(tmp_path):
     w.save(tmp_path / "w.npz")
     again = Weights.load(tmp_path / "w.npz")
     assert again.training == w.training
-    assert again.sizes == (EXTENDED, 5, 5, 5, 2)
+    assert again.sizes == (EXTENDED, 5, 5, 5, 3)
     x = np.random.default_rng(0).normal(size=(9, EXTENDED)).astype(np.float32)
     np.testing.assert_array_equal(again.evaluate(x), w.evaluate(x))
 
@@ -132,11 +229,11 @@ def test_files_that_are_no_weights_are_one_sentence(tmp_path):
 
 def test_weights_for_another_scene_name_the_field_and_both_values():
     w = weights("direct")
-    require_fit(w, "w.npz", {"spacing": D})
+    require_fit(w, "w.npz", {"support_ratio": R / D})
     with pytest.raises(
-        InputError, match=r"^w.npz: spacing is 0.001 in the weights, 0.002 in the scene"
+        InputError, match=r"^w.npz: thickening is 17.3 in the weights, 1 in the scene"
     ):
-        require_fit(w, "w.npz", {"support_radius": R, "spacing": 2.0 * D})
+        require_fit(w, "w.npz", {"support_ratio": R / D, "thickening": 1.0})
 
 
 def run(*options: str) -> subprocess.CompletedProcess[str]:
@@ -161,9 +258,18 @@ def test_shipped_weights_pour_a_height_they_never_saw(tmp_path):
     assert json.loads(again.read_text())["kinetic_energy"] == told["kinetic_energy"]
 
 
-def test_shipped_weights_refuse_another_scene():
-    weights = ROOT / "assets" / "vessels" / "aortoiliac" / "pcnet.npz"
-    result = run("A", "--weights", str(weights))
-    assert result.returncode == 2
-    assert result.stderr.strip().count("\n") == 0
-    assert "spacing is 0.0009 in the weights, 0.0004402 in the scene" in result.stderr
+def test_shipped_weights_refuse_another_liquid(tmp_path):
+    folder = tmp_path / "thin"
+    shutil.copytree(ROOT / "assets" / "vessels" / "tube", folder)
+    scene = folder / "scene.toml"
+    text = scene.read_text()
+    for old, new, field in (
+        ("[blood]", "[blood]\nartificial_viscosity = 0.2", "artificial_viscosity is 0.05 in the"),
+        ("[discretization]", "[discretization]\nsupport_ratio = 3.0", "support_ratio is 2 in the"),
+    ):
+        assert old in text
+        scene.write_text(text.replace(old, new))
+        result = run(str(folder))
+        assert result.returncode == 2
+        assert result.stderr.strip().count("\n") == 0
+        assert field in result.stderr

@@ -1,0 +1,275 @@
+"""`vesselflow ladder`: from the paper's network to the default one, each rung measured alike.
+
+A rung is an entry of RUNGS.  Each is trained on each dataset with several seeds; run 0 chooses the
+weights, the last run, which nothing has looked at, gives the figures.
+"""
+
+import contextlib
+import json
+import multiprocessing
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.output import write_json
+from nn.dataset import Dataset
+from nn.features import COUNT, NAMES
+from nn.train import Course, Settings, train_weights, use_threads
+from nn.weights import CLIP, Weights
+
+Fit = Callable[[Course, Settings], Weights]
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One kind of network."""
+
+    name: str
+    settings: Settings
+    fit: Fit | None = None
+    """Makes the weights without a training; `settings` then only says what they are."""
+
+
+def linear(course: Course, settings: Settings, matrix: np.ndarray, offset: np.ndarray) -> Weights:
+    """A direct network without hidden layers: a = matrix F + offset, both in R/T^2."""
+    return Weights(
+        ((matrix.astype(np.float32), offset.astype(np.float32)),),
+        np.zeros(COUNT, np.float32),
+        # Nothing is clipped.
+        np.full(COUNT, 1e6 / CLIP, np.float32),
+        np.full(3, 1e6 / CLIP, np.float32),
+        course.training(settings, ""),
+    )
+
+
+def persistence(course: Course, settings: Settings) -> Weights:
+    """a_i^{n+1} = a_i^n."""
+    return linear(course, settings, np.eye(3, COUNT), np.zeros(3))
+
+
+def ridge(course: Course, settings: Settings) -> Weights:
+    """Ridge regression of the target on the 23 features, by their own deviations."""
+    features, target = course.examples(32)
+    x = features[:, :COUNT].astype(np.float64)
+    mean, deviation = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
+    z = (x - mean) / deviation
+    y = target / course.scales.acceleration
+    weight = np.linalg.solve(z.T @ z + 1e-3 * len(z) * np.eye(COUNT), z.T @ (y - y.mean(axis=0)))
+    matrix = (weight / deviation[:, None]).T
+    return linear(course, settings, matrix, y.mean(axis=0) - matrix @ mean)
+
+
+DIRECT = Settings(head="direct")
+RUNGS = (
+    Rung("previous acceleration", replace(DIRECT, correction="none"), persistence),
+    Rung("ridge, 23 features", replace(DIRECT, correction="none"), ridge),
+    Rung("direct, bp", replace(DIRECT, correction="bp")),
+    Rung("direct, periodic", replace(DIRECT, correction="periodic")),
+    Rung("direct, relabel", replace(DIRECT, correction="relabel")),
+    Rung("pressure, no input", Settings(inputs=())),
+    Rung("pressure, bp", Settings(correction="bp")),
+    Rung("pressure, relabel", Settings()),
+    Rung("pressure, all 25 inputs", Settings(inputs=NAMES)),
+)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One rung on one dataset with one seed."""
+
+    data: Path
+    rung: int
+    seed: int
+    iterations: int
+    arch: str
+
+
+def measure(task: Task) -> dict[str, Any]:
+    """Train and roll out; needs a process of its own, since it starts Taichi."""
+    from taichi_sph.runtime import start
+
+    use_threads(1)
+    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
+        start(task.arch, "f32", 1, random_seed=task.seed)
+    rung = RUNGS[task.rung]
+    settings = replace(rung.settings, seed=task.seed, iterations=task.iterations)
+    with Dataset(task.data) as file:
+        last = len(file.runs) - 1
+        before = time.perf_counter()
+        if rung.fit is None:
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "weights.npz"
+                weights, _ = train_weights(task.data, out, settings, [0, last], report=_quiet)
+        course = Course(file, [0, last])
+        if rung.fit is not None:
+            weights = rung.fit(course, settings)
+        trained = time.perf_counter() - before
+        run = course.held[-1]
+        figures = course.rollout(course.pcnet(weights), run)
+        return {
+            "rung": rung.name,
+            "data": task.data.name,
+            "substeps": run.facts.substeps,
+            "sound_speed": run.facts.sound_speed,
+            "seed": task.seed,
+            "training_seconds": trained,
+            **figures,
+        }
+
+
+def _quiet(_: object) -> None:
+    """Report nothing."""
+
+
+def main(
+    data: list[Path],
+    out: Path,
+    seeds: int,
+    iterations: int,
+    processes: int,
+    plot: Path | None,
+    arch: str,
+) -> None:
+    """Measure what is not yet in `out`, and print the table.
+
+    Raises:
+        InputError: a dataset cannot be read.
+    """
+    for path in data:
+        with Dataset(path):
+            pass
+    done: list[dict[str, Any]] = []
+    if out.exists() and out.stat().st_size:
+        done = json.loads(out.read_text())["rows"]
+    there = {(row["data"], row["rung"], row["seed"]) for row in done}
+    tasks = [
+        Task(path, k, seed, iterations, arch)
+        for path in data
+        for k, rung in enumerate(RUNGS)
+        # What is fitted without chance needs no second seed.
+        for seed in range(1 if rung.fit else seeds)
+        if (path.name, rung.name, seed) not in there
+    ]
+    context = multiprocessing.get_context("spawn")
+    # Taichi frees no field: a process for each task.
+    with context.Pool(processes, maxtasksperchild=1) as pool:
+        for row in pool.imap_unordered(measure, tasks):
+            done.append(row)
+            write_json(out, {"iterations": iterations, "rows": done})
+            print(
+                f"{row['data']}, {row['rung']}, seed {row['seed']}: "
+                f"survived {row['survived']:.2f} ({len(done)} done)",
+                file=sys.stderr,
+            )
+    lines = summarise(done)
+    print_table(lines)
+    if plot is not None:
+        draw(lines, plot)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A rung on a dataset: medians over its seeds."""
+
+    rung: str
+    substeps: int
+    sound_speed: float
+    alive: int
+    """Seeds that lived to the end."""
+    seeds: int
+    survived: float
+    path_error: float
+    drained_error: float
+    compression_p99: float
+    training_seconds: float
+
+
+def summarise(rows: list[dict[str, Any]]) -> list[Line]:
+    """A line for each rung and dataset, in the order of RUNGS."""
+    lines = []
+    order = [rung.name for rung in RUNGS]
+    keys = {(row["sound_speed"], row["substeps"], order.index(row["rung"])) for row in rows}
+    for sound_speed, substeps, k in sorted(keys):
+        mine = [
+            row
+            for row in rows
+            if (row["rung"], row["substeps"], row["sound_speed"])
+            == (order[k], substeps, sound_speed)
+        ]
+
+        def median(name: str, mine: list[dict[str, Any]] = mine) -> float:
+            return statistics.median(row[name] for row in mine)
+
+        lines.append(
+            Line(
+                order[k],
+                substeps,
+                sound_speed,
+                sum(row["survived"] == 1.0 for row in mine),
+                len(mine),
+                median("survived"),
+                median("path_error"),
+                median("drained_error"),
+                median("compression_p99"),
+                median("training_seconds"),
+            )
+        )
+    return lines
+
+
+def print_table(lines: list[Line]) -> None:
+    """The ladder for people."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="rollouts on a run never seen: medians over seeds, up to a death")
+    headings = ("rung", "c m/s", "M", "alive", "survived", "path", "drained", "p99", "training s")
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "rung" else "right")
+    for line in lines:
+        table.add_row(
+            line.rung,
+            f"{line.sound_speed:.1f}",
+            str(line.substeps),
+            f"{line.alive}/{line.seeds}",
+            f"{100 * line.survived:.0f} %",
+            f"{100 * line.path_error:.1f} %",
+            f"{100 * line.drained_error:.1f} %",
+            f"{100 * line.compression_p99:.1f} %",
+            f"{line.training_seconds:.0f}",
+        )
+    (Console() if sys.stdout.isatty() else Console(width=120)).print(table)
+
+
+def draw(lines: list[Line], path: Path) -> None:
+    """Draw how long each rung lives, and how wrong those are that live, over M."""
+    from matplotlib.figure import Figure
+
+    names = [rung.name for rung in RUNGS]
+    speeds = sorted({line.sound_speed for line in lines})
+    columns = [
+        (c, m) for c in speeds for m in sorted({x.substeps for x in lines if x.sound_speed == c})
+    ]
+    grid = np.full((len(names), len(columns)), np.nan)
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    for line in lines:
+        row, column = names.index(line.rung), columns.index((line.sound_speed, line.substeps))
+        grid[row, column] = 100.0 * line.survived
+        lives = line.alive == line.seeds
+        worst = max(line.path_error, line.drained_error, line.compression_p99)
+        text = f"{100 * worst:.1f} %" if lives else f"dies\\nat {100 * line.survived:.0f} %"
+        axes.text(column, row, text, ha="center", va="center", fontsize=8)
+    image = axes.imshow(grid, cmap="RdYlGn", vmin=0.0, vmax=100.0, aspect="auto", alpha=0.8)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xticks(range(len(columns)), [f"M = {m}\\nc = {c:.3g} m/s" for c, m in columns])
+    axes.set_title("colour: part of the pour survived; number: largest error of those that live")
+    figure.colorbar(image, label="survived [%]")
+    figure.savefig(path, dpi=120)
