@@ -24,8 +24,7 @@ from taichi_sph.simulation import Simulation
 from taichi_sph.vessel import Vessel, read_vessel
 
 FEW = 0.2
-"""Centres of mass are compared while this part of the blood is in the vessel: few drops say little
-of it."""
+"""Part of the blood below which its centre of mass says little."""
 
 
 @dataclass

@@ -39,12 +39,12 @@ class Rung:
 
 def linear(course: Course, settings: Settings, matrix: np.ndarray, offset: np.ndarray) -> Weights:
     """A direct network without hidden layers: a = matrix F + offset, both in R/T^2."""
+    wide = 1e6 / CLIP  # nothing is clipped
     return Weights(
-        ((matrix.astype(np.float32), offset.astype(np.float32)),),
+        ((matrix.astype(np.float32), (offset / wide).astype(np.float32)),),
         np.zeros(COUNT, np.float32),
-        # Nothing is clipped.
-        np.full(COUNT, 1e6 / CLIP, np.float32),
-        np.full(3, 1e6 / CLIP, np.float32),
+        np.full(COUNT, wide, np.float32),
+        np.full(3, wide, np.float32),
         course.training(settings, ""),
     )
 
@@ -249,7 +249,7 @@ def print_table(lines: list[Line]) -> None:
 
 
 def draw(lines: list[Line], path: Path) -> None:
-    """Draw how long each rung lives, and how wrong those are that live, over M."""
+    """Draw which rungs live, and how wrong those are that live, over M."""
     from matplotlib.figure import Figure
 
     names = [rung.name for rung in RUNGS]
@@ -262,14 +262,13 @@ def draw(lines: list[Line], path: Path) -> None:
     axes = figure.add_subplot()
     for line in lines:
         row, column = names.index(line.rung), columns.index((line.sound_speed, line.substeps))
-        grid[row, column] = 100.0 * line.survived
         lives = line.alive == line.seeds
         worst = max(line.path_error, line.drained_error, line.compression_p99)
-        text = f"{100 * worst:.1f} %" if lives else f"dies\\nat {100 * line.survived:.0f} %"
+        grid[row, column] = 100.0 * max(0.0, 1.0 - 3.0 * worst) if lives else 0.0
+        text = f"{100 * worst:.1f} %" if lives else f"dies at {100 * line.survived:.0f} %"
         axes.text(column, row, text, ha="center", va="center", fontsize=8)
-    image = axes.imshow(grid, cmap="RdYlGn", vmin=0.0, vmax=100.0, aspect="auto", alpha=0.8)
+    axes.imshow(grid, cmap="RdYlGn", vmin=0.0, vmax=100.0, aspect="auto", alpha=0.7)
     axes.set_yticks(range(len(names)), names)
-    axes.set_xticks(range(len(columns)), [f"M = {m}\\nc = {c:.3g} m/s" for c, m in columns])
-    axes.set_title("colour: part of the pour survived; number: largest error of those that live")
-    figure.colorbar(image, label="survived [%]")
+    axes.set_xticks(range(len(columns)), [f"M = {m}\nc = {c:.3g} m/s" for c, m in columns])
+    axes.set_title("largest error of a pour never seen (median of the seeds), or when it dies")
     figure.savefig(path, dpi=120)

@@ -18,6 +18,7 @@ import itertools
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -55,6 +56,9 @@ DEVIATION_FLOOR = 1e-3
 
 DIED = 0.3
 """99th percentile of compression at which a rollout counts as dead."""
+
+FEW = 0.2
+"""Part of the blood below which its centre of mass says little."""
 
 INPUTS = {"direct": NAMES[:COUNT], "pressure": ("N", "D_rv_b", "M", "compression", "divergence")}
 """Features that each head sees by default."""
@@ -171,9 +175,11 @@ class Model(torch.nn.Module):
         self.training_facts = training
         self.columns = list(training.columns.index)
         sizes = (len(self.columns), *([WIDTH] * DEPTH), 3)
-        self.layers = torch.nn.ModuleList(
-            torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)
-        )
+        with warnings.catch_warnings():  # of a network without inputs
+            warnings.filterwarnings("ignore", message="Initializing zero-element tensors")
+            self.layers = torch.nn.ModuleList(
+                torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)
+            )
         self.mean = torch.from_numpy(mean.astype(np.float32))
         self.deviation = torch.from_numpy(deviation.astype(np.float32))
         self.scale = scale
@@ -238,6 +244,9 @@ class Course:
         self.scene = largest.scene
         self.stage = Stage(self.scene, read_vessel(self.scene), largest.facts.seed)
         self.physics: AccelerationModel = self.stage.model
+        low, high = self.stage.vessel.bounds
+        self.extent = float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
+        """Diagonal of the vessel's box [m]."""
         self.interval = facts.frame_interval
         ratio = self.scene.discretization.wall_spacing_ratio
         self.scales = FeatureScales(
@@ -312,9 +321,10 @@ class Course:
     def rollout(self, model: AccelerationModel, run: Run) -> dict[str, float]:
         """Roll a model out from the first frame of a run and compare.
 
-        Returns: survived (fraction of frames before it died: diverged, or compression beyond DIED),
-        path_error (largest distance of the centres of mass over the recorded path's length, while
-        a fifth of the blood is there), drained_error (largest difference of the drained fraction),
+        Returns: survived (fraction of frames before it died: diverged, compression beyond DIED,
+        blood gone that should be there, or farther off than the vessel is long), path_error
+        (largest distance of the centres of mass over the recorded path's length, while FEW of the
+        blood are there), drained_error (largest difference of the drained fraction),
         compression_p99 (largest).
         """
         stage, frames = self.stage, len(run)
@@ -330,22 +340,26 @@ class Course:
             except RunError:
                 break
             n = stage.particles.count[None]
-            if not n or not alive.any():
+            if not alive.any() or (not n and alive.mean() < FEW):
                 survived = frames
+                break
+            if not n:
                 break
             density = stage.particles.density.to_numpy()[:n] / stage.fluid.state.rest_density
             compression = float(np.percentile(np.maximum(density - 1.0, 0.0), 99))
             worst = max(worst, compression)
             if not compression < DIED:
                 break
-            survived = frame
             centre = run.position(frame)[alive].mean(axis=0)
             here = stage.particles.position.to_numpy()[:n].mean(axis=0)
-            if alive.mean() > 0.2:
+            if alive.mean() > FEW:
                 length += float(np.linalg.norm(centre - last)) if last is not None else 0.0
                 distance = max(distance, float(np.linalg.norm(here - centre)))
+            if distance > self.extent:
+                break
             last = centre
             drained = max(drained, abs(n / len(alive) - float(alive.mean())))
+            survived = frame
         return {
             "survived": survived / frames,
             "path_error": distance / max(length, 1e-9),

@@ -155,6 +155,22 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path,
         train_weights(data, cut, settings, [0], report=quiet)
 
 
+def test_ridge_finds_a_straight_line(box, monkeypatch):
+    """Targets that are linear in the features, with an offset, are met nearly exactly."""
+    with Dataset(box / "data.h5") as file:
+        course = Course(file, [0])
+        features, _ = course.examples(32)
+        line = np.random.default_rng(0).normal(size=(COUNT, 3)) / features[:, :COUNT].std(
+            axis=0, keepdims=True
+        ).T.clip(1e-3)
+        target = (features[:, :COUNT] @ line + 3.0) * course.scales.acceleration
+        monkeypatch.setattr(course, "examples", lambda _: (features, target))
+        weights = ridge(course, Settings(head="direct"))
+    found = weights.evaluate(features[:, :COUNT]) * course.scales.acceleration
+    # The penalty is a thousandth of a feature's variance.
+    assert np.abs(found - target).max() < 0.02 * np.abs(target - target.mean(axis=0)).max()
+
+
 def test_persistence_gives_back_the_previous_acceleration(box):
     with Dataset(box / "data.h5") as file:
         course = Course(file, [0])
