@@ -124,9 +124,8 @@ class KilledError(Exception):
     """Stands for whatever ends a training early."""
 
 
-@pytest.mark.parametrize("correction", ["relabel", "periodic"])
-def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path, correction):
-    settings = Settings(iterations=20, validate_every=5, correction=correction)
+def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path):
+    settings = Settings(iterations=20, validate_every=5)
     data, whole, cut = box / "data.h5", tmp_path / "whole.npz", tmp_path / "cut.npz"
 
     def quiet(_: Progress) -> None:
@@ -140,7 +139,7 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path,
     with pytest.raises(KilledError):
         train_weights(data, cut, settings, [0], report=kill)
     checkpoint = tmp_path / "cut.npz.checkpoint"
-    other = Settings(iterations=20, validate_every=5, correction=correction, seed=1)
+    other = Settings(iterations=20, validate_every=5, seed=1)
     with pytest.raises(InputError, match=r"cut.npz.checkpoint: holds a training with seed 0"):
         train_weights(data, cut, other, [0], report=quiet)
     weights, history = train_weights(data, cut, settings, [0], report=quiet)
