@@ -1,6 +1,5 @@
 """The command line: it parses and wires, and turns errors into one sentence and an exit code."""
 
-import contextlib
 import os
 import signal
 import sys
@@ -169,8 +168,7 @@ def run(
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
 
-    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
-        start(arch, precision, threads, random_seed=seed)
+    start(arch, precision, threads, random_seed=seed)
     options = {}
     if model == "pcnet":
         from app.scenes import weights_for
@@ -537,8 +535,7 @@ def compare(
     if json_file is not None:
         check_output(json_file, "--json", b"{")
     check_plot(plot)
-    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
-        start(arch, "f32", threads, random_seed=seed)
+    start(arch, "f32", threads, random_seed=seed)
     files = list(weights) or [weights_for(scene)]
     results = comparison.compare(
         scene, files, list(soft), until or scene.duration, seed, json_file, plot

@@ -121,7 +121,7 @@ def result_of(one: Contestant, first: Contestant, frame_interval: float) -> Resu
         speed_up=sum(first.seconds[1:frames]) / max(1e-9, sum(one.seconds[1:frames])),
         most_leaks=one.most_leaks,
         wall_corrections=simulation.wall_corrections,
-        fallback_share=simulation.fallback_time / simulation.time if simulation.time else 0.0,
+        fallback_share=simulation.fallback_share,
         compression_p99=max(one.compression, default=0.0),
         path_error=float(distance / length) if length else 0.0,
         drained_error=float(np.abs(drained - reference).max(initial=0.0)),

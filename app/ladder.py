@@ -4,7 +4,6 @@ A rung is an entry of RUNGS.  Each is trained on each dataset with several seeds
 weights, the last run, which nothing has looked at, gives the figures.
 """
 
-import contextlib
 import json
 import multiprocessing
 import statistics
@@ -96,8 +95,7 @@ def measure(task: Task) -> dict[str, Any]:
     from taichi_sph.runtime import start
 
     use_threads(1)
-    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
-        start(task.arch, "f32", 1, random_seed=task.seed)
+    start(task.arch, "f32", 1, random_seed=task.seed)
     rung = RUNGS[task.rung]
     settings = replace(rung.settings, seed=task.seed, iterations=task.iterations)
     with Dataset(task.data) as file:

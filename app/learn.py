@@ -1,6 +1,5 @@
 """`vesselflow train`: progress on the terminal, curves in files."""
 
-import contextlib
 import importlib.util
 import sys
 from collections.abc import Sequence
@@ -54,8 +53,7 @@ def train(
     from taichi_sph.runtime import start
 
     use_threads(threads)
-    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
-        start(arch, "f32", threads, random_seed=settings.seed)
+    start(arch, "f32", threads, random_seed=settings.seed)
 
     def report(at: "Progress") -> None:
         left = at.seconds / at.iteration * (settings.iterations - at.iteration)

@@ -264,8 +264,7 @@ def record_run(task: Task, report: Callable[[int, int], None]) -> None:
         OSError: the disk is full.
     """
     facts = task.facts
-    with contextlib.redirect_stdout(None):  # ti.init prints a line whatever its log level
-        start(facts.architecture, "f32", task.threads, random_seed=facts.seed)
+    start(facts.architecture, "f32", task.threads, random_seed=facts.seed)
     simulation = Stage(task.scene, read_vessel(task.scene), facts.seed)
     scales = FeatureScales(
         facts.support_radius, facts.spacing, facts.frame_interval, facts.sound_speed,

@@ -73,6 +73,11 @@ class Motion:
         self.time += dt
         self.steps += 1
 
+    @property
+    def fallback_share(self) -> float:
+        """Part of the simulated time in which the model fell back to the physics."""
+        return self.fallback_time / self.time if self.time else 0.0
+
     def before_build(self) -> None:
         """Mark particles that are to be removed; nothing here."""
 

@@ -1,5 +1,7 @@
 """Start Taichi: the only call of `ti.init` in the repository."""
 
+import contextlib
+
 import taichi as ti
 
 from taichi_sph.errors import InputError
@@ -32,19 +34,20 @@ def start(
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: allowed are {', '.join(PRECISIONS)}")
     options = {"cpu_max_num_threads": threads} if threads else {}
-    ti.init(
-        arch=[ti.cuda, ti.metal] if arch == "gpu" else ti.cpu,
-        default_fp=PRECISIONS[precision],
-        default_ip=ti.i32,
-        # Halves the cost of the sums (square roots, quotients).  It lets the compiler assume that
-        # nothing is NaN, so `integrator.is_finite` looks at the bits.
-        fast_math=True,
-        debug=debug,
-        short_circuit_operators=True,
-        random_seed=random_seed,
-        log_level=ti.ERROR,
-        offline_cache=True,
-        **options,
-    )
+    with contextlib.redirect_stdout(None):  # it prints a line whatever its log level
+        ti.init(
+            arch=[ti.cuda, ti.metal] if arch == "gpu" else ti.cpu,
+            default_fp=PRECISIONS[precision],
+            default_ip=ti.i32,
+            # Halves the cost of the sums (square roots, quotients).  It lets the compiler assume
+            # that nothing is NaN, so `integrator.is_finite` looks at the bits.
+            fast_math=True,
+            debug=debug,
+            short_circuit_operators=True,
+            random_seed=random_seed,
+            log_level=ti.ERROR,
+            offline_cache=True,
+            **options,
+        )
     if arch == "gpu" and ti.cfg.arch in (ti.x64, ti.arm64):
         raise InputError("--arch gpu: no CUDA or Metal device was found; use --arch cpu")

@@ -181,5 +181,5 @@ class Simulation(Motion):
             compression_max=largest,
             kinetic_energy=float(0.5 * self.particles.mass * speed2.sum()),
             max_speed=float(np.sqrt(speed2.max(initial=0.0))),
-            fallback_share=self.fallback_time / self.time if self.time else 0.0,
+            fallback_share=self.fallback_share,
         )

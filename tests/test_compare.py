@@ -21,7 +21,7 @@ FALL = np.array([0.0, -0.01, 0.0])
 def run(drained: list[float], offset: float = 0.0, seconds: float = 1.0) -> Contestant:
     """A run whose centre falls by FALL a frame, `offset` [m] to the side."""
     frames = len(drained)
-    simulation = SimpleNamespace(steps=10 * frames, wall_corrections=0, fallback_time=0.0, time=1.0)
+    simulation = SimpleNamespace(steps=10 * frames, wall_corrections=0, fallback_share=0.0)
     one = Contestant("x", simulation)  # type: ignore[arg-type]
     one.drained = drained
     one.centre = [k * FALL + np.array([offset, 0.0, 0.0]) for k in range(frames)]
