@@ -195,11 +195,7 @@ def as_json(scene: Scene, runs: list[Contestant], results: list[Result]) -> dict
     derived = runs[0].simulation.derived
     rows = []
     for run, result in zip(runs, results, strict=True):
-        row = {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in asdict(result).items()
-        }
-        rows.append(row | {"drained": run.drained, "compression": run.compression})
+        rows.append(asdict(result) | {"drained": run.drained, "compression": run.compression})
     return {
         "scene": scene.name,
         "blood_particles": derived.blood_particles,

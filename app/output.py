@@ -40,17 +40,22 @@ def check_output(path: Path, option: str, begins: bytes) -> None:
         raise InputError(f"{option} {path}: cannot be written: {error.strerror}") from None
 
 
+def _plain(value: Any) -> Any:
+    """A value with null for every number that JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def write_json(path: Path, value: dict[str, Any]) -> None:
     """Write a JSON file so that it is either the old one or the whole new one.
 
     Raises:
         OSError: the disk is full, or the folder is gone.
     """
-    plain = {
-        key: None if isinstance(item, float) and not math.isfinite(item) else item
-        for key, item in value.items()
-    }
-    text = json.dumps(plain, indent=2, allow_nan=False) + "\n"
+    text = json.dumps(_plain(value), indent=2, allow_nan=False) + "\n"
     if path.exists() and not path.is_file():
         path.write_text(text)  # a device or a pipe: nothing to replace
         return

@@ -35,6 +35,8 @@ import taichi as ti
 COUNT = 23
 EXTENDED = 25
 """With two more, for density is not among the paper's: 50 max(rho/rho_0 - 1, 0) and T div v."""
+GATHERED = 27
+"""With what no network sees: rho/rho_0 and the response of the density (see `features_of`)."""
 BINS = 6
 TABLE_VERSION = 2
 """Raised when a definition above changes; weights of another version are refused."""
@@ -153,7 +155,7 @@ def features_of(
     first sum only (Bender and Koschier 2017, doi:10.1109/TVCG.2016.2578335, eq. 9).
     What `inputs` leaves out is 0.  Reads: position, velocity, acceleration.
     """
-    f = ti.Vector([0.0] * 27)
+    f = ti.Vector([0.0] * GATHERED)
     x_i = p.position[i]
     v_i = p.velocity[i]
     if ti.static(inputs.among(0, 1, 2)):
@@ -277,5 +279,5 @@ def extract(
     """What `features_of` gives, for every live particle.  Writes: out[identity, 27]."""
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, ALL)
-        for k in ti.static(range(27)):
+        for k in ti.static(range(GATHERED)):
             out[p.identity[i], k] = f[k]

@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 
 from nn.dataset import State, Substeps
-from nn.features import EXTENDED, FeatureScales, extract
+from nn.features import GATHERED, FeatureScales, extract
 from taichi_sph.acceleration import Fluid, SphAcceleration
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
@@ -26,7 +26,7 @@ class Stage(Simulation):
         super().__init__(scene, vessel, self._make_model, seed)
         self.step_limit = self.derived.step
         self._taken: list[float] = []
-        self._features = ti.ndarray(float, (self.particles.capacity, EXTENDED + 2))
+        self._features = ti.ndarray(float, (self.particles.capacity, GATHERED))
 
     def _make_model(self, fluid: Fluid, capacity: int) -> SphAcceleration:
         self.fluid = fluid

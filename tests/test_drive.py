@@ -170,6 +170,9 @@ def test_json_is_replaced_whole(tmp_path: Path) -> None:
     file = tmp_path / "summary.json"
     write_json(file, {"a": 1, "b": float("nan")})
     assert json.loads(file.read_text()) == {"a": 1, "b": None}
+    write_json(file, {"rows": [{"b": float("inf"), "c": (1.5, float("nan"))}]})
+    assert json.loads(file.read_text()) == {"rows": [{"b": None, "c": [1.5, None]}]}
+    write_json(file, {"a": 1, "b": float("nan")})
     with pytest.raises(TypeError):
         write_json(file, {"a": object()})
     assert json.loads(file.read_text()) == {"a": 1, "b": None}

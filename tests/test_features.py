@@ -17,7 +17,7 @@ from builders import (
     precision,
     sphere,
 )
-from nn.features import BINS, COUNT, EXTENDED, NAMES, FeatureScales, extract
+from nn.features import BINS, COUNT, EXTENDED, GATHERED, NAMES, FeatureScales, extract
 
 SCALES = FeatureScales(R, D, 4e-4, 2.0, WALL_SPACING / D)
 FLUID = make_fluid()
@@ -89,7 +89,7 @@ def cloud(seed: int) -> Stage:
 
 def extracted(stage: Stage) -> np.ndarray:
     """What the kernel finds, by identity, (n, 27)."""
-    out = ndarray(float, (stage.particles.capacity, EXTENDED + 2))
+    out = ndarray(float, (stage.particles.capacity, GATHERED))
     extract(stage.particles, stage.wall, stage.neighbors, FLUID, SCALES, out)
     return out.to_numpy()[: stage.particles.count[None]]
 
