@@ -18,13 +18,11 @@ from app.output import write_json
 from app.progress import Progress
 from nn.pcnet import load_pcnet
 from taichi_sph.acceleration import SphAcceleration
+from taichi_sph.diagnostics import FEW
 from taichi_sph.errors import RunError
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 from taichi_sph.vessel import Vessel, read_vessel
-
-FEW = 0.2
-"""Part of the blood below which its centre of mass says little."""
 
 
 @dataclass

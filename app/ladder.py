@@ -22,6 +22,7 @@ from nn.dataset import Dataset
 from nn.features import COUNT, NAMES
 from nn.train import Course, Settings, train_weights, use_threads
 from nn.weights import CLIP, Weights
+from taichi_sph.errors import InputError
 
 Fit = Callable[[Course, Settings], Weights]
 
@@ -126,6 +127,29 @@ def _quiet(_: object) -> None:
     """Report nothing."""
 
 
+def _read(out: Path, iterations: int) -> list[dict[str, Any]]:
+    """Rows measured before.
+
+    Raises:
+        InputError: the file is not a ladder's, or of trainings of another length.
+    """
+    if not out.exists() or not out.stat().st_size:
+        return []
+    try:
+        found = json.loads(out.read_text())
+        rows, before = found["rows"], found["iterations"]
+    except (ValueError, KeyError):
+        raise InputError(
+            f"--out {out}: not the figures of a ladder, or cut; name another"
+        ) from None
+    if before != iterations:
+        raise InputError(
+            f"--out {out}: holds trainings of {before} iterations, asked for are {iterations}; "
+            "name another file, or ask for the same"
+        )
+    return rows
+
+
 def main(
     data: list[Path],
     out: Path,
@@ -138,14 +162,12 @@ def main(
     """Measure what is not yet in `out`, and print the table.
 
     Raises:
-        InputError: a dataset cannot be read.
+        InputError: a dataset cannot be read, or `out` holds something else.
     """
     for path in data:
         with Dataset(path):
             pass
-    done: list[dict[str, Any]] = []
-    if out.exists() and out.stat().st_size:
-        done = json.loads(out.read_text())["rows"]
+    done = _read(out, iterations)
     there = {(row["data"], row["rung"], row["seed"]) for row in done}
     tasks = [
         Task(path, k, seed, iterations, arch)

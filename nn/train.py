@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nn.dataset import Dataset, Run
+from nn.dataset import Dataset, Run, mean_acceleration
 from nn.features import COUNT, NAMES, FeatureScales
 from nn.pcnet import (
     LARGEST_DAMPING,
@@ -41,6 +41,7 @@ from nn.stage import Stage
 from nn.weights import CLIP, Training, Weights, proportions
 from taichi_sph.acceleration import AccelerationModel
 from taichi_sph.calibration import softening
+from taichi_sph.diagnostics import FEW, compression
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.vessel import read_vessel
 
@@ -56,9 +57,6 @@ DEVIATION_FLOOR = 1e-3
 
 DIED = 0.3
 """99th percentile of compression at which a rollout counts as dead."""
-
-FEW = 0.2
-"""Part of the blood below which its centre of mass says little."""
 
 INPUTS = {"direct": NAMES[:COUNT], "pressure": ("N", "D_rv_b", "M", "compression", "divergence")}
 """Features that each head sees by default."""
@@ -304,8 +302,8 @@ class Course:
         stage.advance_to(stage.time + self.interval)
         stage.settle()
         after = stage.state()
-        target = (after.velocity.astype(np.float64) - before.velocity) / self.interval
-        return np.where(after.alive[:, None], target, 0.0), before.alive & after.alive
+        target = mean_acceleration(before.velocity, after.velocity, after.alive, self.interval)
+        return target, before.alive & after.alive
 
     def examples(self, frames: int) -> tuple[np.ndarray, np.ndarray]:
         """Features (n, 27) and targets [m/s^2] (n, 3) from frames all over the training runs."""
@@ -345,10 +343,10 @@ class Course:
                 break
             if not n:
                 break
-            density = stage.particles.density.to_numpy()[:n] / stage.fluid.state.rest_density
-            compression = float(np.percentile(np.maximum(density - 1.0, 0.0), 99))
-            worst = max(worst, compression)
-            if not compression < DIED:
+            density = stage.particles.density.to_numpy()[:n]
+            p99, _ = compression(density, stage.fluid.state.rest_density)
+            worst = max(worst, p99)
+            if not p99 < DIED:
                 break
             centre = run.position(frame)[alive].mean(axis=0)
             here = stage.particles.position.to_numpy()[:n].mean(axis=0)
@@ -383,8 +381,6 @@ class Progress:
     seconds: float = 0.0
     """Wall time so far [s]."""
     history: list[dict[str, float]] = field(default_factory=list)
-    losses: list[float] = field(default_factory=list)
-    """Since the last validation."""
 
 
 def train_weights(
@@ -441,6 +437,7 @@ def train_weights(
         checkpoint = out.with_name(out.name + ".checkpoint")
         at = _resume(checkpoint, identity, parts, generator) or Progress()
         before = at.seconds
+        losses: list[float] = []  # since the last validation
 
         while at.iteration < settings.iterations:
             at.iteration += 1
@@ -455,16 +452,16 @@ def train_weights(
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
                 optimiser.step()
-                at.losses.append(float(loss.detach()))
+                losses.append(float(loss.detach()))
             schedule.step()
             if at.iteration % settings.validate_every and at.iteration < settings.iterations:
                 continue
             weights = model.weights()
             net.network.load(weights)
             figures = course.rollout(net, course.held[0])
-            mean = float(np.mean(at.losses)) if at.losses else math.nan
+            mean = float(np.mean(losses)) if losses else math.nan
             at.history.append({"iteration": at.iteration, "loss": mean, **figures})
-            at.losses.clear()
+            losses.clear()
             if score_of(figures) > at.best:
                 at.best = score_of(figures)
                 replace(weights, training=replace(training, validation=figures)).save(out)

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+FEW = 0.2
+"""Part of the blood below which its centre of mass says little."""
+
 
 @dataclass(frozen=True)
 class Diagnostics:

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="torch is an extra: pip install 'vesselflow[train]'")
 
 from app.ladder import RUNGS, main, summarise
+from taichi_sph.errors import InputError
 
 
 def row(rung: str, seed: int, survived: float, path_error: float) -> dict[str, object]:
@@ -58,8 +59,15 @@ def test_one_rung_is_measured_and_what_is_measured_is_not_repeated(box: Path, tm
         for rung in RUNGS
         for seed in range(1 if rung.fit else 2)
     ]
-    out.write_text(json.dumps({"rows": rows}))
+    out.write_text(json.dumps({"iterations": 6, "rows": rows}))
     before = out.read_bytes()
     main([data], out, 2, 6, 1, picture, "cpu")  # nothing is left to measure
     assert out.read_bytes() == before
     assert picture.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(InputError, match="holds trainings of 6 iterations, asked for are 7"):
+        main([data], out, 2, 7, 1, None, "cpu")
+    for text in ("{", '{"rows": []}'):
+        out.write_text(text)
+        with pytest.raises(InputError, match="not the figures of a ladder"):
+            main([data], out, 2, 6, 1, None, "cpu")
+        assert out.read_text() == text
