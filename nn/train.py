@@ -546,8 +546,8 @@ def _resume(
         return None
     try:
         found = torch.load(path, weights_only=True)
-    except Exception as error:  # torch names no errors of its own
-        raise InputError(f"{path}: not a checkpoint, or a cut one ({error}); delete it") from None
+    except Exception:  # torch names no errors of its own
+        raise InputError(f"{path}: not a checkpoint, or a cut one; delete it") from None
     for name, value in identity.items():
         if found["identity"].get(name) != value:
             raise InputError(

@@ -158,9 +158,10 @@ class Weights:
             raise InputError(
                 f"{path}: cannot read the weights: {error.strerror or error}"
             ) from None
-        except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError) as error:
+        except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError):
             raise InputError(
-                f"{path}: not a weights file of vesselflow, or a cut one ({error})"
+                f"{path}: not a weights file of vesselflow, or a cut one; `vesselflow train` "
+                "makes them"
             ) from None
 
 
