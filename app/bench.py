@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from app.output import write_json
+from app.output import console, write_json
 from app.scenes import weights_for
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene, parse_scene, read_scene
@@ -103,10 +103,11 @@ def measure_split(path: Path, weights: Path, arch: str, threads: int | None) -> 
     """
     import taichi as ti
 
-    from nn.pcnet import PcNet, load_pcnet
+    from nn.pcnet import PressurePcNet, load_pcnet
     from nn.weights import Weights
     from taichi_sph import Simulation, start
     from taichi_sph.acceleration import sum_acceleration, sum_density
+    from taichi_sph.implicit import correct_pressure
     from taichi_sph.integrator import kick_drift, survey
 
     start(arch, threads=threads)
@@ -114,11 +115,11 @@ def measure_split(path: Path, weights: Path, arch: str, threads: int | None) -> 
     simulation = Simulation.from_scene(scene, load_pcnet(weights, scene))
     simulation.advance_to(0.05)
     net = simulation.model
-    assert isinstance(net, PcNet)
+    assert isinstance(net, PressurePcNet)
     full = Weights.load(weights)
     inputs = full.sizes[0]
     flat = replace(full, layers=((np.zeros((3, inputs), np.float32), np.zeros(3, np.float32)),))
-    shallow = PcNet(flat, net.physics.fluid, net.scales, simulation.particles.capacity)
+    shallow = PressurePcNet(flat, net.physics.fluid, net.scales, simulation.particles.capacity)
     p, w, nb = simulation.particles, simulation.wall, simulation.neighbors
     fluid, scratch = net.physics.fluid, (net.physics.pressure_term, net.physics.viscosity)
     gravity = ti.Vector(scene.gravity)
@@ -128,10 +129,13 @@ def measure_split(path: Path, weights: Path, arch: str, threads: int | None) -> 
         "physics: forces": lambda: sum_acceleration(
             p, w, nb, fluid, *scratch, net.physics.stress, gravity
         ),
-        "PcNet: features and network": lambda: net.predict(p, w, nb),
-        "PcNet: features, no hidden layer": lambda: shallow.predict(p, w, nb),
+        "PcNet: features and network": lambda: net.guess(p, w, nb),
+        "PcNet: features, no hidden layer": lambda: shallow.guess(p, w, nb),
         "PcNet: forces": lambda: sum_acceleration(
             p, w, nb, net.fluid, *scratch, net.physics.stress, gravity
+        ),
+        "PcNet: correction": lambda: correct_pressure(
+            p, w, nb, net.fluid, net.interval, net.response, net.physics.pressure_term
         ),
         "survey": lambda: survey(p),
         "integration, wall": lambda: kick_drift(p, w, nb, False, 0.0),
@@ -361,14 +365,13 @@ def main(
     Raises:
         InputError: the peer is asked for and not installed.
     """
-    from rich.console import Console
     from rich.table import Table
 
     if peer and not has_peer():
         raise InputError("--peer: pysplishsplash is not installed; pip install 'vesselflow[peer]'")
-    console = Console() if sys.stdout.isatty() else Console(width=120)
+    terminal = console()
     machine = _machine(arch, threads)
-    console.print(", ".join(f"{key} {value}" for key, value in machine.items()))
+    terminal.print(", ".join(f"{key} {value}" for key, value in machine.items()))
     rows: list[Row] = []
     for path in scenes:
         rows.append(_in_own_process(measure_scene, path, arch, threads, 0.1))
@@ -433,9 +436,9 @@ def main(
             f"{row.real_time_factor:.5f}",
             f"{row.memory_mib:.0f}",
         )
-    console.print(table)
+    terminal.print(table)
     for note in notes:
-        console.print(note)
+        terminal.print(note)
     if json_file:
         result = {"machine": machine, "rows": [asdict(r) for r in rows], "starts": starts}
         result["passes"] = passes

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
+from app.models import MODELS
 from taichi_sph.errors import InputError, RunError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from app.drive import Summary
     from taichi_sph.scene import Scene
 
@@ -117,10 +116,10 @@ def cli() -> None:
 )
 @click.option(
     "--model",
-    type=click.Choice(["physics", "pcnet"]),
+    type=click.Choice(MODELS),
     default="physics",
     show_default=True,
-    help="What computes accelerations; pcnet is the trained network.",
+    help="What computes accelerations; implicit takes long steps, so does pcnet, a network.",
 )
 @click.option(
     "--weights",
@@ -164,18 +163,13 @@ def run(
         raise InputError("--weights: only --model pcnet has weights")
 
     from app.drive import drive
+    from app.models import maker_of
     from app.progress import Progress
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
 
     start(arch, precision, threads, random_seed=seed)
-    options = {}
-    if model == "pcnet":
-        from app.scenes import weights_for
-        from nn.pcnet import load_pcnet
-
-        options["make_model"] = load_pcnet(weights or weights_for(scene), scene)
-    simulation = Simulation.from_scene(scene, seed=seed, **options)
+    simulation = Simulation.from_scene(scene, maker_of(model, scene, weights), seed)
     view = None
     if rrd is not None or live is not None:
         from app.view import RerunView
@@ -257,6 +251,13 @@ def summary_text(summary: "Summary") -> str:
     show_default=True,
     help="Run of the data that is not trained on; the first one given chooses the weights.",
 )
+@click.option(
+    "--rounds",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Rounds of better pressures after the network's guess, a step.",
+)
 @click.option("--iterations", type=click.IntRange(min=1), default=600, show_default=True)
 @click.option(
     "--plot", type=output_path, metavar="FILE", help="Draw loss and rollouts into a picture (PNG)."
@@ -270,6 +271,7 @@ def train(
     head: str,
     correction: str,
     hold_out: tuple[int, ...],
+    rounds: int,
     iterations: int,
     plot: Path | None,
     arch: str,
@@ -284,11 +286,13 @@ def train(
 
     command = f"vesselflow train {data.name} --head {head} --correction {correction}"
     command += "".join(f" --hold-out {run}" for run in hold_out)
-    command += f" --iterations {iterations} --seed {seed}"
+    command += f" --rounds {rounds} --iterations {iterations} --seed {seed}"
     learn.require_torch("train")
     from nn.train import Settings
 
-    settings = Settings(head=head, correction=correction, iterations=iterations, seed=seed)
+    settings = Settings(
+        head=head, correction=correction, rounds=rounds, iterations=iterations, seed=seed
+    )
     click.echo(learn.train(data, out, settings, hold_out, command, plot, arch, threads))
     return 0
 
@@ -359,6 +363,7 @@ def record(
 @cli.command()
 def scenes() -> None:
     """List the shipped scenes."""
+    from app.output import console
     from app.scenes import scenes_table
 
     console().print(scenes_table())
@@ -368,6 +373,7 @@ def scenes() -> None:
 @click.argument("scene_name", metavar="SCENE")
 def info(scene_name: str) -> None:
     """Check a scene's vessel and print the numbers that follow from the scene."""
+    from app.output import console
     from app.scenes import find_scene, info_tables
 
     out = console()
@@ -544,11 +550,100 @@ def compare(
     return 0
 
 
-def console() -> "Console":
-    """Standard output; wide where it is no terminal, so that nothing is cut."""
-    from rich.console import Console
+@cli.command()
+@click.argument("scene_names", metavar="SCENE...", nargs=-1, required=True)
+@click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (CSV).")
+@click.option("--plot", type=output_path, metavar="FILE", help="Draw the chart (PNG).")
+@click.option(
+    "--height", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="Column [m]."
+)
+@click.option(
+    "--until",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Simulated time [s].  [default: each scene's duration]",
+)
+@click.option(
+    "--weights",
+    type=output_path,
+    multiple=True,
+    metavar="FILE",
+    help="Chart this network too; may be given again.",
+)
+@click.option("--only", default="", metavar="TEXT", help="Only methods with this in their name.")
+@arch_option
+@threads_option
+def chart(
+    scene_names: tuple[str, ...],
+    out: Path,
+    plot: Path | None,
+    height: float | None,
+    until: float | None,
+    weights: tuple[Path, ...],
+    only: str,
+    arch: str,
+    threads: int | None,
+) -> int:
+    """Chart what each method costs against how far it is from a finer pour.
 
-    return Console() if sys.stdout.isatty() else Console(width=140)
+    What is in FILE already is not measured again: scenes can be added one by one.
+    """
+    import msgspec
+
+    from app import chart as charting
+    from app.learn import check_plot
+    from app.output import check_output
+    from app.scenes import find_scene
+
+    check_output(out, "--out", b"scene,")
+    check_plot(plot)
+    scenes = []
+    for name in scene_names:
+        scene = with_column(find_scene(name), None, height)
+        if height is not None:
+            scene = msgspec.structs.replace(scene, name=f"{scene.name}-{1e3 * height:g}mm")
+        scenes.append(scene)
+    charting.main(scenes, until, out, weights, only, plot, arch, threads)
+    return 0
+
+
+@cli.command()
+@click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (CSV).")
+@click.option("--plot", type=output_path, metavar="FILE", help="Draw the matrix (PNG).")
+@click.option("--starts", type=click.IntRange(min=1), default=3, show_default=True)
+@click.option("--quick", is_flag=True, help="One start, and no case longer than 0.2 s.")
+@click.option("--only", default="", metavar="TEXT", help='Only what has this in "METHOD, CASE".')
+@click.option(
+    "--weights",
+    type=output_path,
+    multiple=True,
+    metavar="FILE",
+    help="Test this network too; may be given again.",
+)
+@click.option("--processes", type=click.IntRange(min=1), default=1, show_default=True)
+@arch_option
+def stability(
+    out: Path,
+    plot: Path | None,
+    starts: int,
+    quick: bool,
+    only: str,
+    weights: tuple[Path, ...],
+    processes: int,
+    arch: str,
+) -> int:
+    """Run every method where methods fail, and say which live.
+
+    What is in FILE already is not measured again.
+    """
+    from app import stability as study
+    from app.learn import check_plot
+    from app.output import check_output
+
+    check_output(out, "--out", b"method,")
+    check_plot(plot)
+    study.main(out, starts, quick, only, weights, processes, plot, arch)
+    return 0
 
 
 def one_sentence(error: OSError) -> str:

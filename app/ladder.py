@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from app.output import write_json
+from app.output import console, write_json
 from nn.dataset import Dataset
 from nn.features import COUNT, NAMES
 from nn.train import Course, Settings, train_weights, use_threads
@@ -77,6 +77,8 @@ RUNGS = (
     Rung("pressure, bp", Settings(correction="bp")),
     Rung("pressure, relabel", Settings()),
     Rung("pressure, all 25 inputs", Settings(inputs=NAMES)),
+    Rung("pressure, relabel, 1 round", Settings(rounds=1)),
+    Rung("pressure, relabel, 2 rounds", Settings(rounds=2)),
 )
 
 
@@ -101,13 +103,13 @@ def measure(task: Task) -> dict[str, Any]:
     settings = replace(rung.settings, seed=task.seed, iterations=task.iterations)
     with Dataset(task.data) as file:
         last = len(file.runs) - 1
+        course = Course(file, [0, last])
         before = time.perf_counter()
         if rung.fit is None:
             with tempfile.TemporaryDirectory() as folder:
                 out = Path(folder) / "weights.npz"
-                weights, _ = train_weights(task.data, out, settings, [0, last], report=_quiet)
-        course = Course(file, [0, last])
-        if rung.fit is not None:
+                weights, _ = train_weights(course, out, settings, report=_quiet)
+        else:
             weights = rung.fit(course, settings)
         trained = time.perf_counter() - before
         run = course.held[-1]
@@ -246,7 +248,6 @@ def summarise(rows: list[dict[str, Any]]) -> list[Line]:
 
 def print_table(lines: list[Line]) -> None:
     """The ladder for people."""
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title="rollouts on a run never seen: medians over seeds, up to a death")
@@ -265,7 +266,7 @@ def print_table(lines: list[Line]) -> None:
             f"{100 * line.compression_p99:.1f} %",
             f"{line.training_seconds:.0f}",
         )
-    (Console() if sys.stdout.isatty() else Console(width=120)).print(table)
+    console().print(table)
 
 
 def draw(lines: list[Line], path: Path) -> None:

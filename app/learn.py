@@ -49,7 +49,8 @@ def train(
     curves = out.with_suffix(".history.json")
     check_output(curves, "--out", b"{")
 
-    from nn.train import train_weights, use_threads
+    from nn.dataset import Dataset
+    from nn.train import Course, train_weights, use_threads
     from taichi_sph.runtime import start
 
     use_threads(threads)
@@ -60,7 +61,8 @@ def train(
         figures = "  ".join(f"{name} {value:.3g}" for name, value in at.history[-1].items())
         print(f"{figures}  ({duration(at.seconds)}, {duration(left)} left)", file=sys.stderr)
 
-    weights, history = train_weights(data, out, settings, held_out, command, report)
+    with Dataset(data) as file:
+        weights, history = train_weights(Course(file, held_out), out, settings, command, report)
     write_json(curves, {"command": command, "validations": history})
     if plot is not None:
         draw(history, plot)

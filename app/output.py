@@ -1,11 +1,18 @@
 """Files that a run leaves: checked before the slow part, written whole or not at all."""
 
+import csv
+import io
 import json
 import math
 import os
+import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from rich.console import Console
 
 from taichi_sph.errors import InputError
 
@@ -55,7 +62,15 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
     Raises:
         OSError: the disk is full, or the folder is gone.
     """
-    text = json.dumps(_plain(value), indent=2, allow_nan=False) + "\n"
+    write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file so that it is either the old one or the whole new one.
+
+    Raises:
+        OSError: the disk is full, or the folder is gone.
+    """
     if path.exists() and not path.is_file():
         path.write_text(text)  # a device or a pipe: nothing to replace
         return
@@ -72,3 +87,39 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
     except BaseException:
         os.unlink(name)
         raise
+
+
+RowType = TypeVar("RowType")
+
+
+def read_rows(path: Path, row: type[RowType]) -> list[RowType]:
+    """Rows of a CSV file as a dataclass of strings and numbers; none of a file that is not there.
+
+    Raises:
+        InputError: it holds something else.
+    """
+    if not path.exists() or not path.stat().st_size:
+        return []
+    columns: Any = fields(row)  # type: ignore[arg-type]
+    try:
+        with path.open(newline="") as file:
+            return [
+                row(**{c.name: c.type(line[c.name]) for c in columns})
+                for line in csv.DictReader(file)
+            ]
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise InputError(f"--out {path}: holds something else, or is cut; name another") from None
+
+
+def write_rows(path: Path, rows: Sequence[Any]) -> None:
+    """Write dataclasses of one kind as CSV, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [c.name for c in fields(rows[0])], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    write_text(path, text.getvalue())
+
+
+def console() -> Console:
+    """Standard output; wide where it is no terminal, so that nothing is cut."""
+    return Console() if sys.stdout.isatty() else Console(width=160)

@@ -7,12 +7,11 @@ is pushed apart, the wall pushes in and viscosity dissipates whatever the weight
 
     p_i/rho_i^2 = max(0, k_i (rho_i/rho_0 - 1) - g_i T div v_i) / (T^2 rho_0 D_i)
     mu_i        = min(eta exp(o_2), 0.03 rho_0 R^2/T)
-    k_i = 0.8 sigmoid(o_0),  g_i = 0.1 sigmoid(o_1)
+    k_i = sigmoid(o_0),  g_i = 0.3 sigmoid(o_1)          (0.8 and 0.1 without rounds)
 
-D_i is how much the particle's density answers to its own pressure (see `features_of`): with
-k = g = 1 this is the first iteration of divergence-free SPH.  A step is stable where k + 2 g stays
-under 4 over the largest eigenvalue of v -> D^-1 grad div v, which is 3.8 on the most disordered
-cloud tried: the factors hold that for any weights.  Weakly compressible SPH, linearised, is
+It is the first guess of `taichi_sph.implicit`, whose rounds follow: as many as the weights were
+trained with.  Without any, a step is stable where k + 2 g stays under 4/3.8; the factors hold that,
+and what the rounds need, for any weights.  Weakly compressible SPH, linearised, is
 k = (c T/R)^2 R^2 D, g = 0.  Viscosity is learned as a multiple of the blood's own at high shear,
 eta; its bound is what an explicit step T bears (Morris et al. 1997).  Monaghan's artificial term
 stays as the scene has it.
@@ -31,7 +30,15 @@ import taichi as ti
 
 from nn.features import FeatureScales, Inputs, features_of
 from nn.weights import CLIP, Weights, proportions, require_fit
-from taichi_sph.acceleration import Fluid, SphAcceleration, sum_acceleration
+from taichi_sph.acceleration import Fluid, SphAcceleration
+from taichi_sph.implicit import (
+    DAMPING,
+    LARGEST_ADVANCE,
+    LARGEST_VISCOSITY,
+    LEAST_RESPONSE,
+    STIFFNESS,
+    ImplicitAcceleration,
+)
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
 from taichi_sph.rheology import Casson
@@ -40,17 +47,15 @@ from taichi_sph.wall import Wall
 
 VARIABLE = Casson(eta=1.0, tau_y=0.0, n=1.0)
 """Tells the pairwise sum that viscosity differs from particle to particle; never evaluated."""
-LARGEST_STIFFNESS = 0.8
-LARGEST_DAMPING = 0.1
-LARGEST_VISCOSITY = 0.03
 LARGEST_EXPONENT = 10.0
 """Keeps exp finite in single precision, long after the bound has taken over."""
 LARGEST_COMPRESSION = 0.1
 """What the direct head may let happen; the physics stays under 0.02."""
-LARGEST_ADVANCE = 0.4
-"""Way of a particle in a step, over R; twice what blood does in the runs of docs/learned.md."""
-LEAST_RESPONSE = 0.5
-"""R^2 D is 1.8 on a lattice; a lone pair that hardly touches must not be thrown apart."""
+
+
+def largest_factors(rounds: int) -> tuple[float, float]:
+    """Bounds of k and g that keep any weights stable."""
+    return (STIFFNESS, DAMPING) if rounds else (0.8, 0.1)
 
 
 @dataclass(eq=False)
@@ -142,20 +147,17 @@ def evaluate(network: ti.template(), f: ti.template()):
     return hidden
 
 
-class PcNet:
-    """The learned acceleration; stands where `SphAcceleration` stands.
+class DirectPcNet:
+    """The paper's head: the network gives the acceleration itself.
 
-    The pressure head cannot run away, and takes shorter steps only where blood is faster than
-    LARGEST_ADVANCE allows.  The direct head can: while a particle is compressed or fast beyond all
-    training, the physics takes over.  (Under the pressure head it must not: stiff physics throws
-    apart what a soft pressure has let come close.  It killed a run that lives without.)
+    Nothing keeps it from running away: while a particle is compressed or fast beyond all training,
+    the physics takes over.
     """
 
     name = "pcnet"
 
     def __init__(self, weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int):
         """Make the scratch fields for `capacity` particles."""
-        self.head = weights.training.head
         self.network = Network.upload(weights)
         self.fluid = replace(fluid, rheology=VARIABLE, nested=False)
         self.scales = scales
@@ -163,7 +165,7 @@ class PcNet:
         self.guarded = True
         """Whether the physics may take over."""
         self.fell_back = False
-        self.next_acceleration = ti.Vector.field(3, float, capacity if self.head == "direct" else 1)
+        self.next_acceleration = ti.Vector.field(3, float, capacity)
 
     def accelerate(
         self,
@@ -172,32 +174,16 @@ class PcNet:
         neighbors: Neighbors,
         gravity: tuple[float, float, float],
     ) -> None:
-        """Features and network, then (pressure head) the pairwise sum."""
-        scratch = self.physics.pressure_term, self.physics.viscosity
-        if self.head == "direct":
-            alarms = predict_acceleration(
-                particles, wall, neighbors, self.fluid, self.scales, self.network,
-                self.next_acceleration,
-            )  # fmt: skip
-            self.fell_back = self.guarded and alarms > 0
-            if self.fell_back:
-                self.physics.accelerate(particles, wall, neighbors, gravity)
-            else:
-                copy_vectors(particles, self.next_acceleration)
-        else:
-            self.predict(particles, wall, neighbors)
-            sum_acceleration(
-                particles, wall, neighbors, self.fluid, *scratch, self.physics.stress,
-                ti.Vector(gravity),
-            )  # fmt: skip
-
-    def predict(self, particles: Particles, wall: Wall, neighbors: Neighbors) -> None:
-        """Pressure and viscosity of each particle, by the pressure head."""
-        physics = self.physics
-        predict_pressure(
+        """Features and network; or the physics."""
+        alarms = predict_acceleration(
             particles, wall, neighbors, self.fluid, self.scales, self.network,
-            physics.pressure_term, physics.viscosity, physics.fluid.rheology.eta,
+            self.next_acceleration,
         )  # fmt: skip
+        self.fell_back = self.guarded and alarms > 0
+        if self.fell_back:
+            self.physics.accelerate(particles, wall, neighbors, gravity)
+        else:
+            copy_vectors(particles, self.next_acceleration)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """The trained step [s], or less: LARGEST_ADVANCE at most, or the physics' own."""
@@ -205,6 +191,43 @@ class PcNet:
             return self.physics.stable_step(largest_speed, largest_acceleration)
         largest = self.scales.speed_limit * LARGEST_ADVANCE
         return self.scales.frame_interval * min(1.0, largest / max(largest_speed, largest))
+
+
+class PressurePcNet(ImplicitAcceleration):
+    """The default head: the network makes the first guess of the pressure.
+
+    It cannot run away, and the physics must not guard it: what a soft pressure has let come close,
+    stiff physics throws apart.  (It killed a run that lives without.)
+    """
+
+    name = "pcnet"
+
+    def __init__(self, weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int):
+        """Make the scratch fields for `capacity` particles."""
+        rounds = weights.training.rounds
+        super().__init__(fluid, capacity, scales.frame_interval, rounds)
+        self.eta = fluid.rheology.eta
+        self.fluid = replace(self.fluid, rheology=VARIABLE)
+        self.network = Network.upload(weights)
+        self.scales = scales
+
+    def guess(self, particles: Particles, wall: Wall, neighbors: Neighbors) -> None:
+        """As without a network, by features and network."""
+        stiffness, damping = largest_factors(self.rounds)
+        predict_pressure(
+            particles, wall, neighbors, self.fluid, self.scales, self.network, stiffness, damping,
+            self.eta, self.physics.pressure_term, self.physics.viscosity, self.response,
+        )  # fmt: skip
+
+
+PcNet = DirectPcNet | PressurePcNet
+"""The learned acceleration; stands where `SphAcceleration` stands."""
+
+
+def make_pcnet(weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int) -> PcNet:
+    """The head that the weights are for."""
+    head = DirectPcNet if weights.training.head == "direct" else PressurePcNet
+    return head(weights, fluid, scales, capacity)
 
 
 def scales_of(weights: Weights, fluid: Fluid, spacing: float, wall_ratio: float) -> FeatureScales:
@@ -227,7 +250,7 @@ def load_pcnet(path: Path, scene: Scene) -> Callable[[Fluid, int], PcNet]:
         found = {"support_ratio": grid.support_ratio, **proportions(fluid)}
         require_fit(weights, str(path), found)
         scales = scales_of(weights, fluid, grid.spacing, grid.wall_spacing_ratio)
-        return PcNet(weights, fluid, scales, capacity)
+        return make_pcnet(weights, fluid, scales, capacity)
 
     return make
 
@@ -286,26 +309,29 @@ def predict_pressure(
     fluid: ti.template(),
     scales: ti.template(),
     network: ti.template(),
+    largest_stiffness: float,
+    largest_damping: float,
+    eta: float,
     pressure_term: ti.template(),
     viscosity: ti.template(),
-    eta: float,
+    response: ti.template(),
 ):
-    """The pressure head's p/rho^2 and mu.  Writes: pressure_term, viscosity, density."""
+    """The pressure head's q^0, mu and T^2 rho_0 D.
+
+    Writes: pressure_term, viscosity, response, density.
+    """
     rest_density = ti.static(fluid.state.rest_density)
+    thickest = ti.static(
+        LARGEST_VISCOSITY * fluid.state.rest_density * scales.support_radius * scales.speed_limit
+    )
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, network.inputs)
         p.density[i] = f[25] * rest_density
+        response[i] = ti.static(fluid.state.rest_density / scales.speed_limit**2) * ti.max(
+            LEAST_RESPONSE, f[26]
+        )
         o = evaluate(network, f)
-        excess = LARGEST_STIFFNESS * sigmoid(o[0]) * (f[25] - 1.0)
-        excess -= LARGEST_DAMPING * sigmoid(o[1]) * f[24]
-        pressure_term[i] = (
-            ti.static(scales.speed_limit**2 / rest_density)
-            * ti.max(0.0, excess)
-            / ti.max(LEAST_RESPONSE, f[26])
-        )
-        viscosity[i] = ti.min(
-            ti.static(
-                LARGEST_VISCOSITY * rest_density * scales.support_radius * scales.speed_limit
-            ),
-            eta * ti.exp(ti.min(o[2], LARGEST_EXPONENT)),
-        )
+        excess = largest_stiffness * sigmoid(o[0]) * (f[25] - 1.0)
+        excess -= largest_damping * sigmoid(o[1]) * f[24]
+        pressure_term[i] = ti.max(0.0, excess) / response[i]
+        viscosity[i] = ti.min(thickest, eta * ti.exp(ti.min(o[2], LARGEST_EXPONENT)))

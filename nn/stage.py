@@ -5,7 +5,7 @@ import taichi as ti
 
 from nn.dataset import State, Substeps
 from nn.features import GATHERED, FeatureScales, extract
-from taichi_sph.acceleration import Fluid, SphAcceleration
+from taichi_sph.acceleration import Fluid, SphAcceleration, sum_density
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 from taichi_sph.vessel import Vessel
@@ -20,6 +20,7 @@ class Stage(Simulation):
 
     fluid: Fluid
     """The constants of the physics."""
+    physics: SphAcceleration
 
     def __init__(self, scene: Scene, vessel: Vessel, seed: int):
         """As `Simulation`, by the physics and with no step longer than the scene's own."""
@@ -30,7 +31,8 @@ class Stage(Simulation):
 
     def _make_model(self, fluid: Fluid, capacity: int) -> SphAcceleration:
         self.fluid = fluid
-        return SphAcceleration(fluid, capacity)
+        self.physics = SphAcceleration(fluid, capacity)
+        return self.physics
 
     def step(self, remaining: float) -> None:
         """As `Simulation`; the step is noted."""
@@ -65,15 +67,7 @@ class Stage(Simulation):
     def restore(self, state: State, time: float, steps: int) -> None:
         """Go back, or on, to a state at a time [s] after a number of steps."""
         rows = np.flatnonzero(state.alive)
-        for field, values in (
-            (self.particles.position, state.position),
-            (self.particles.velocity, state.velocity),
-            (self.particles.identity, np.arange(len(state.alive))),
-        ):
-            whole = field.to_numpy()
-            whole[: len(rows)] = values[rows]
-            field.from_numpy(whole)
-        self.particles.count[None] = len(rows)
+        self.put(rows, state.position[rows], state.velocity[rows])
         self.time = time
         self.steps = steps
         self.settle()
@@ -85,6 +79,14 @@ class Stage(Simulation):
         rows = particles.acceleration.to_numpy()
         rows[: len(identity)] = acceleration[identity]
         particles.acceleration.from_numpy(rows)
+
+    def viscosity(self) -> np.ndarray:
+        """The physics' viscosity of the blood as it stands [Pa s], a row a particle."""
+        own = self.physics
+        sum_density(
+            self.particles, self.wall, self.neighbors, own.fluid, own.pressure_term, own.viscosity
+        )
+        return own.viscosity.to_numpy()[: self.particles.count[None]]
 
     def features(self, scales: FeatureScales) -> np.ndarray:
         """What `nn.features.features_of` gives for the state as it stands, a row a particle."""

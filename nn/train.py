@@ -29,20 +29,14 @@ import torch
 
 from nn.dataset import Dataset, Run, mean_acceleration
 from nn.features import COUNT, NAMES, FeatureScales
-from nn.pcnet import (
-    LARGEST_DAMPING,
-    LARGEST_EXPONENT,
-    LARGEST_STIFFNESS,
-    LARGEST_VISCOSITY,
-    LEAST_RESPONSE,
-    PcNet,
-)
+from nn.pcnet import LARGEST_EXPONENT, DirectPcNet, PcNet, largest_factors, make_pcnet
 from nn.stage import Stage
 from nn.weights import CLIP, Training, Weights, proportions
 from taichi_sph.acceleration import AccelerationModel
 from taichi_sph.calibration import softening
 from taichi_sph.diagnostics import FEW, compression
 from taichi_sph.errors import InputError, RunError
+from taichi_sph.implicit import LARGEST_VISCOSITY, LEAST_RESPONSE, RELAXATION
 from taichi_sph.vessel import read_vessel
 
 PERIOD = 5
@@ -54,6 +48,9 @@ DEPTH = 3
 
 DEVIATION_FLOOR = 1e-3
 """Inputs that hardly vary in training must not be blown up by their deviation."""
+
+COMPRESSION = 0.01
+"""Compression that counts as much as an acceleration wrong by all of its deviation."""
 
 DIED = 0.3
 """99th percentile of compression at which a rollout counts as dead."""
@@ -76,6 +73,8 @@ class Settings:
     correction: str = "relabel"
     inputs: tuple[str, ...] | None = None
     """Features seen; the head's of INPUTS if None."""
+    rounds: int = 0
+    """Rounds after the pressure head's guess."""
     iterations: int = 600
     """Gradient steps."""
     batch: int = 4096
@@ -124,7 +123,11 @@ class Sample:
         slope = factors.mass * kernel.slope_of(np.sqrt(r2))
         eps = softening(kernel)
         self.i, self.j = torch.from_numpy(i), torch.from_numpy(j)
-        # a_i = known + sum_j push (P_i + P_j) + drag mu_ij, as `sum_acceleration`.
+        # a_i = known + sum_j push (P_i + P_j) + drag mu_ij, as `sum_acceleration`; and
+        # d(rho_i/rho_0)/dt = squeeze (sum_j push (v_i - v_j) + wall_push v_i).
+        self.velocity = _f32(v)
+        self.thickness = _f32(np.log(stage.viscosity() / fluid.rheology.eta))
+        self.squeeze = -1.0 / (factors.gradient * fluid.state.rest_density)
         self.push = _f32((-factors.gradient * slope)[:, None] * r)
         drag = 2.0 * factors.viscosity * slope * r2 / (r2 + eps)
         self.drag = _f32((drag / (density[i] * density[j]))[:, None] * v_ij)
@@ -164,6 +167,19 @@ def _entries(count: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.nonzero(inside)[0], index[inside].astype(np.int64)
 
 
+@dataclass
+class Step:
+    """What a step of the network does to the blood of a sample."""
+
+    acceleration: torch.Tensor
+    """[m/s^2], (n, 3)"""
+    thickness: torch.Tensor | None = None
+    """ln(mu/eta), (n,), learned from the physics' viscosity: accelerations teach none, for what
+    they have of noise too much of it would damp."""
+    compression: torch.Tensor | None = None
+    """max(rho/rho_0 - 1, 0) that is left at the end of the step, (n,)."""
+
+
 class Model(torch.nn.Module):
     """The same network in torch, with the head's sums."""
 
@@ -182,8 +198,8 @@ class Model(torch.nn.Module):
         self.deviation = torch.from_numpy(deviation.astype(np.float32))
         self.scale = scale
         if training.head == "pressure":
-            with torch.no_grad():  # begin half soft, half damped, as thin as at high shear
-                self.layers[-1].bias[:] = 0.0
+            with torch.no_grad():  # begin nearly as hard and as damped as it may be
+                self.layers[-1].bias[:] = torch.tensor((3.0, 3.0, 1.0))
 
     def outputs(self, features: torch.Tensor) -> torch.Tensor:
         """Outputs of the network for all features (n, 27)."""
@@ -192,25 +208,39 @@ class Model(torch.nn.Module):
             y = torch.nn.functional.softsign(layer(y))
         return self.layers[-1](y) * self.scale
 
-    def acceleration(self, sample: Sample, rest_density: float, eta: float) -> torch.Tensor:
-        """Acceleration of every particle of a sample [m/s^2], gravity only if it was learned."""
+    def step(self, sample: Sample, rest_density: float, eta: float, gravity: torch.Tensor) -> Step:
+        """What a step does to every particle, as `PcNet` does it."""
         t = self.training_facts
         o = self.outputs(sample.features)
         if t.head == "direct":
-            return o * (t.support_radius / t.frame_interval**2)
+            return Step(o * (t.support_radius / t.frame_interval**2))
         speed = t.support_radius / t.frame_interval
         f = sample.features
-        excess = LARGEST_STIFFNESS * torch.sigmoid(o[:, 0]) * (f[:, 25] - 1.0)
-        excess = excess - LARGEST_DAMPING * torch.sigmoid(o[:, 1]) * f[:, 24]
-        p = excess.clamp(min=0.0) / f[:, 26].clamp(min=LEAST_RESPONSE)
-        p = p[:, None] * (speed**2 / rest_density)
+        stiffness, damping = largest_factors(t.rounds)
+        compression = f[:, 25] - 1.0
+        excess = stiffness * torch.sigmoid(o[:, 0]) * compression
+        excess = excess - damping * torch.sigmoid(o[:, 1]) * f[:, 24]
+        response = f[:, 26].clamp(min=LEAST_RESPONSE) * (rest_density / speed**2)
+        p = excess.clamp(min=0.0) / response
         bound = LARGEST_VISCOSITY * rest_density * t.support_radius * speed
-        mu = (eta * torch.exp(o[:, 2:].clamp(max=LARGEST_EXPONENT))).clamp(max=bound)
-        mu_i, mu_j = mu[sample.i], mu[sample.j]
-        pairs = sample.push * (p[sample.i] + p[sample.j])
-        pairs = pairs + sample.drag * (2.0 * mu_i * mu_j / (mu_i + mu_j))
-        a = sample.known.index_add(0, sample.i, pairs)
-        return a + sample.wall_push * p + sample.wall_drag * mu
+        thickness = o[:, 2:].clamp(max=LARGEST_EXPONENT)
+        mu = (eta * torch.exp(thickness.detach())).clamp(max=bound)
+        # Not mu[i], whose gradient adds up in an order that varies from run to run.
+        mu_i, mu_j = mu.index_select(0, sample.i), mu.index_select(0, sample.j)
+        drag = sample.drag * (2.0 * mu_i * mu_j / (mu_i + mu_j))
+        rest = sample.known.index_add(0, sample.i, drag) + sample.wall_drag * mu + gravity
+        for remaining in range(t.rounds, -1, -1):
+            both = p.index_select(0, sample.i) + p.index_select(0, sample.j)
+            pairs = sample.push * both[:, None]
+            a = rest.index_add(0, sample.i, pairs) + sample.wall_push * p[:, None]
+            v = sample.velocity + t.frame_interval * a
+            rate = (sample.wall_push * v).sum(dim=1)
+            v_ij = v.index_select(0, sample.i) - v.index_select(0, sample.j)
+            rate = rate.index_add(0, sample.i, (sample.push * v_ij).sum(dim=1))
+            after = compression + t.frame_interval * sample.squeeze * rate
+            if remaining:
+                p = (p + RELAXATION * after / response).clamp(min=0.0)
+        return Step(a, thickness[:, 0], after.clamp(min=0.0))
 
     def weights(self) -> Weights:
         """Raw arrays of the network."""
@@ -237,6 +267,8 @@ class Course:
             InputError: no such run, or no other.
         """
         self.runs, self.held = file.split(held_out)
+        self.held_out = list(held_out)
+        self._nets: dict[Any, PcNet] = {}
         facts = self.facts = self.runs[0].facts
         largest = max((*self.runs, *self.held), key=lambda run: run.facts.particles)
         self.scene = largest.scene
@@ -261,6 +293,7 @@ class Course:
             support_radius=facts.support_radius,
             frame_interval=self.interval,
             substeps=facts.substeps,
+            rounds=0 if settings.head == "direct" else settings.rounds,
             sound_speed=facts.sound_speed,
             wall_spacing_ratio=self.scales.wall_spacing_ratio,
             artificial_viscosity=liquid["artificial_viscosity"],
@@ -273,10 +306,21 @@ class Course:
         )
 
     def pcnet(self, weights: Weights) -> PcNet:
-        """The network as `run` has it, without its guard: what dies here must be seen to die."""
-        net = PcNet(weights, self.stage.fluid, self.scales, self.stage.particles.capacity)
-        net.guarded = False
-        return net
+        """The network as `run` has it, without its guard: what dies here must be seen to die.
+
+        One object for all weights that differ in nothing else, since each costs a compilation.
+        """
+        arrays = tuple(a.tobytes() for a in (weights.mean, weights.deviation, weights.scale))
+        training = weights.training
+        key = training.head, training.inputs, training.rounds, weights.sizes, arrays
+        if key not in self._nets:
+            stage = self.stage
+            net = make_pcnet(weights, stage.fluid, self.scales, stage.particles.capacity)
+            if isinstance(net, DirectPcNet):
+                net.guarded = False
+            self._nets[key] = net
+        self._nets[key].network.load(weights)
+        return self._nets[key]
 
     def put(self, run: Run, frame: int) -> None:
         """Put a recorded frame on the stage."""
@@ -284,14 +328,13 @@ class Course:
         self.stage.set_acceleration(run.acceleration(frame))
 
     def drive(self, model: AccelerationModel, frames: int) -> None:
-        """Take steps of a frame each from where the stage stands, and settle.
+        """Advance by so many frames from where the stage stands, and settle.
 
         Raises:
             RunError: it diverged.
         """
         self.stage.model, self.stage.step_limit = model, math.inf
-        for _ in range(frames):
-            self.stage.step(self.interval)
+        self.stage.advance_to(self.stage.time + frames * self.interval)
         self.stage.settle()
 
     def relabel(self) -> tuple[np.ndarray, np.ndarray]:
@@ -334,7 +377,7 @@ class Course:
         for frame in range(1, frames + 1):
             alive = run.alive(frame)
             try:
-                stage.step(self.interval)
+                stage.advance_to(frame * self.interval)  # in several steps, where blood is fast
             except RunError:
                 break
             n = stage.particles.count[None]
@@ -384,14 +427,13 @@ class Progress:
 
 
 def train_weights(
-    data: Path,
+    course: Course,
     out: Path,
     settings: Settings,
-    held_out: Sequence[int],
     command: str = "",
     report: Callable[[Progress], None] = print,
 ) -> tuple[Weights, list[dict[str, float]]]:
-    """Train on all runs of a file that are not held out; writes `out`.
+    """Train on the runs of a course that are not held out; writes `out`.
 
     The first run held out chooses the weights; nothing looks at the others.
     A training that was cut short goes on from its checkpoint beside `out`, and ends with the same
@@ -401,73 +443,74 @@ def train_weights(
         the weights, and the figures of every validation.
 
     Raises:
-        InputError: no such run, or none left to train on; or a checkpoint of another training.
+        InputError: a checkpoint of another training.
     """
     torch.manual_seed(settings.seed)
     generator = np.random.default_rng(settings.seed)
     began = time.perf_counter()
-    with Dataset(data) as file:
-        course = Course(file, held_out)
-        fluid, direct = course.stage.fluid, settings.head == "direct"
-        density, eta = fluid.state.rest_density, fluid.rheology.eta
-        training = course.training(settings, command)
-        # Gravity joins the pressure head's sums; the direct head learns it or nothing does.
-        gravity = torch.tensor((0.0, 0.0, 0.0) if direct else course.scene.gravity)
-        features, wanted = course.examples(16)
-        seen = features[:, training.columns.index]
-        typical = float((wanted - gravity.numpy()).std())
-        unit = course.scales.acceleration
-        model = Model(
-            training,
-            seen.mean(axis=0),
-            np.maximum(seen.std(axis=0), DEVIATION_FLOOR),
-            typical / unit if direct else 1.0,
-        )
-        optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.iterations)
-        net = course.pcnet(model.weights())
-        huber = torch.nn.HuberLoss(delta=1.0)
-        parts = {"model": model, "optimiser": optimiser, "schedule": schedule}
-        identity = {
-            **asdict(settings),
-            "held_out": list(held_out),
-            "scene_hash": training.scene_hash,
-        }
-        identity |= {"frame_interval": course.interval, "runs": len(course.runs)}
-        checkpoint = out.with_name(out.name + ".checkpoint")
-        at = _resume(checkpoint, identity, parts, generator) or Progress()
-        before = at.seconds
-        losses: list[float] = []  # since the last validation
+    fluid, direct = course.stage.fluid, settings.head == "direct"
+    density, eta = fluid.state.rest_density, fluid.rheology.eta
+    training = course.training(settings, command)
+    # Gravity joins the pressure head's sums; the direct head learns it or nothing does.
+    gravity = torch.tensor((0.0, 0.0, 0.0) if direct else course.scene.gravity)
+    features, wanted = course.examples(16)
+    seen = features[:, training.columns.index]
+    typical = float((wanted - gravity.numpy()).std())
+    unit = course.scales.acceleration
+    model = Model(
+        training,
+        seen.mean(axis=0),
+        np.maximum(seen.std(axis=0), DEVIATION_FLOOR),
+        typical / unit if direct else 1.0,
+    )
+    optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.iterations)
+    net = course.pcnet(model.weights())
+    huber = torch.nn.HuberLoss(delta=1.0)
+    parts = {"model": model, "optimiser": optimiser, "schedule": schedule}
+    identity = {
+        **asdict(settings),
+        "held_out": course.held_out,
+        "scene_hash": training.scene_hash,
+    }
+    identity |= {"frame_interval": course.interval, "runs": len(course.runs)}
+    checkpoint = out.with_name(out.name + ".checkpoint")
+    at = _resume(checkpoint, identity, parts, generator) or Progress()
+    before = at.seconds
+    losses: list[float] = []  # since the last validation
 
-        while at.iteration < settings.iterations:
-            at.iteration += 1
-            sample = _draw(course, settings, at.iteration, generator, net, model)
-            if sample is not None:
-                error = model.acceleration(sample, density, eta) - sample.target
-                error = (error + gravity)[sample.valid] / typical
-                if direct and len(error) > settings.batch:
-                    error = error[torch.randperm(len(error))[: settings.batch]]
-                loss = huber(error, torch.zeros_like(error))
-                optimiser.zero_grad()
-                loss.backward()
-                torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-                optimiser.step()
-                losses.append(float(loss.detach()))
-            schedule.step()
-            if at.iteration % settings.validate_every and at.iteration < settings.iterations:
-                continue
-            weights = model.weights()
-            net.network.load(weights)
-            figures = course.rollout(net, course.held[0])
-            mean = float(np.mean(losses)) if losses else math.nan
-            at.history.append({"iteration": at.iteration, "loss": mean, **figures})
-            losses.clear()
-            if score_of(figures) > at.best:
-                at.best = score_of(figures)
-                replace(weights, training=replace(training, validation=figures)).save(out)
-            at.seconds = before + time.perf_counter() - began
-            _save(checkpoint, identity, parts, generator, at)
-            report(at)
+    while at.iteration < settings.iterations:
+        at.iteration += 1
+        sample = _draw(course, settings, at.iteration, generator, net, model)
+        if sample is not None:
+            found = model.step(sample, density, eta, gravity)
+            error = (found.acceleration - sample.target)[sample.valid] / typical
+            if direct and len(error) > settings.batch:
+                error = error[torch.randperm(len(error))[: settings.batch]]
+            loss = huber(error, torch.zeros_like(error))
+            if found.thickness is not None and found.compression is not None:
+                loss = loss + torch.mean((found.thickness - sample.thickness) ** 2)
+                loss = loss + torch.mean((found.compression / COMPRESSION) ** 2)
+            optimiser.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            optimiser.step()
+            losses.append(float(loss.detach()))
+        schedule.step()
+        if at.iteration % settings.validate_every and at.iteration < settings.iterations:
+            continue
+        weights = model.weights()
+        net.network.load(weights)
+        figures = course.rollout(net, course.held[0])
+        mean = float(np.mean(losses)) if losses else math.nan
+        at.history.append({"iteration": at.iteration, "loss": mean, **figures})
+        losses.clear()
+        if score_of(figures) > at.best:
+            at.best = score_of(figures)
+            replace(weights, training=replace(training, validation=figures)).save(out)
+        at.seconds = before + time.perf_counter() - began
+        _save(checkpoint, identity, parts, generator, at)
+        report(at)
     checkpoint.unlink(missing_ok=True)
     return Weights.load(out), at.history
 

@@ -14,7 +14,7 @@ from taichi_sph.acceleration import Fluid
 from taichi_sph.errors import InputError
 
 HEADS = ("direct", "pressure")
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Training:
     """T, the step of the network [s]."""
     substeps: int
     """M: steps of the physics in T."""
+    rounds: int
+    """Rounds after the pressure head's guess, see taichi_sph.implicit; none of the direct head."""
     sound_speed: float
     """c of the physics that made the data [m/s]."""
     wall_spacing_ratio: float

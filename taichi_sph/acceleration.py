@@ -26,8 +26,11 @@ class AccelerationModel(Protocol):
 
     name: str
     """Short name for summaries."""
-    fell_back: bool
-    """Whether the last acceleration is the physics', since the model did not trust itself."""
+
+    @property
+    def fell_back(self) -> bool:
+        """Whether the last acceleration is the physics', since the model did not trust itself."""
+        ...
 
     def accelerate(
         self,

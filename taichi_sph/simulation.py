@@ -10,6 +10,7 @@ from taichi_sph.calibration import calibrate
 from taichi_sph.derived import Derived, derive
 from taichi_sph.diagnostics import Diagnostics, compression
 from taichi_sph.equation_of_state import Tait
+from taichi_sph.errors import InputError
 from taichi_sph.motion import Motion
 from taichi_sph.neighbors import Neighbors, cells_within, make_grid
 from taichi_sph.particles import Particles
@@ -136,6 +137,42 @@ class Simulation(Motion):
             InputError: the surface cannot be used, or the column does not fit.
         """
         return cls(scene, read_vessel(scene), make_model, seed)
+
+    def place(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Begin again, at time zero, with other blood.
+
+        Args:
+            position: [m], (n, 3); row k gets identity k; n at most what the column had.
+            velocity: [m/s], (n, 3).
+
+        Raises:
+            InputError: there is no room for so many.
+        """
+        particles = self.particles
+        if len(position) > particles.capacity:
+            raise InputError(
+                f"{len(position)} particles: there is room for {particles.capacity}, those of the "
+                "scene's column"
+            )
+        self.put(np.arange(len(position)), position, velocity)
+        particles.acceleration.fill(0.0)
+        self._removed.fill(0)
+        self.time = self.last_step = self.fallback_time = 0.0
+        self.steps = self.wall_corrections = 0
+
+    def put(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Replace the blood: identities (n,), positions [m] and velocities [m/s], (n, 3)."""
+        particles = self.particles
+        for field, rows in (
+            (particles.identity, identity),
+            (particles.position, position),
+            (particles.velocity, velocity),
+        ):
+            whole = field.to_numpy()
+            whole[: len(rows)] = rows
+            field.from_numpy(whole)
+        particles.count[None] = len(identity)
+        self._stale = True
 
     def before_build(self) -> None:
         """Mark what has left through an opening, or out of the box."""

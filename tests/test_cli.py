@@ -135,6 +135,15 @@ def test_positions_recorded_are_those_of_the_simulation(scene: Path, tmp_path: P
     for frame, x in found.items():
         np.testing.assert_array_equal(x, keeper.positions[frame].astype(np.float32))
     assert np.abs(found[3] - found[0]).max() > 0.0
+    # Begun again from the same blood, it does the same: to rounding, for sums go by another order.
+    end = simulation.positions()
+    start = keeper.positions[0]
+    simulation.place(start, np.zeros_like(start))
+    assert (simulation.time, simulation.steps) == (0.0, 0)
+    simulation.advance_to(0.006)
+    assert np.abs(simulation.positions() - end).max() < 1e-9
+    with pytest.raises(InputError, match="there is room for"):
+        simulation.place(np.concatenate([start, start]), np.zeros((2 * len(start), 3)))
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -1,5 +1,6 @@
 """Training: torch's sums are the kernels', and a short training learns. Needs torch, an extra."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -13,7 +14,7 @@ from app.scenes import find_scene  # noqa: E402
 from builders import vesselflow  # noqa: E402
 from nn.dataset import Dataset  # noqa: E402
 from nn.features import COUNT, FeatureScales  # noqa: E402
-from nn.pcnet import PcNet  # noqa: E402
+from nn.pcnet import DirectPcNet, make_pcnet  # noqa: E402
 from nn.stage import Stage  # noqa: E402
 from nn.train import (  # noqa: E402
     INPUTS,
@@ -56,13 +57,20 @@ def stage() -> Stage:
     return stage
 
 
-@pytest.mark.parametrize("head", ["direct", "pressure"])
-def test_what_torch_trains_is_what_the_kernels_run(stage, head, precision):
+@pytest.fixture(scope="module")
+def course(box: Path) -> Iterator[Course]:
+    """One for all trainings: each new one compiles everything again."""
+    with Dataset(box / "data.h5") as file:
+        yield Course(file, [0])
+
+
+@pytest.mark.parametrize(("head", "rounds"), [("direct", 0), ("pressure", 0), ("pressure", 2)])
+def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precision):
     d, radius = stage.scene.discretization.spacing, stage.fluid.kernel.support_radius
     sound = stage.derived.sound_speed
     scales = FeatureScales(radius, d, 2e-4, sound)
     training = Training(
-        head, INPUTS[head], d, radius, 2e-4, 4, sound, 1.0, 0.05, 17.3, "bp", 0, "tube", ""
+        head, INPUTS[head], d, radius, 2e-4, 4, rounds, sound, 1.0, 0.05, 17.3, "bp", 0, "tube", ""
     )
     torch.manual_seed(1)
     features = stage.features(scales)[:, training.columns.index]
@@ -71,10 +79,13 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, precision):
     sample = Sample(stage, scales, np.zeros((n, 3)), np.ones(n, bool), pairs=head == "pressure")
     with torch.no_grad():
         fluid = stage.fluid
-        expected = model.acceleration(sample, fluid.state.rest_density, fluid.rheology.eta).numpy()
-    net = PcNet(model.weights(), stage.fluid, scales, stage.particles.capacity)
-    net.guarded = False
-    net.accelerate(stage.particles, stage.wall, stage.neighbors, (0.0, 0.0, 0.0))
+        down = torch.tensor((0.0, 0.0 if head == "direct" else -9.81, 0.0))
+        density, eta = fluid.state.rest_density, fluid.rheology.eta
+        expected = model.step(sample, density, eta, down).acceleration.numpy()
+    net = make_pcnet(model.weights(), stage.fluid, scales, stage.particles.capacity)
+    if isinstance(net, DirectPcNet):
+        net.guarded = False
+    net.accelerate(stage.particles, stage.wall, stage.neighbors, (0.0, -9.81, 0.0))
     found = stage.particles.acceleration.to_numpy()[:n]
     scale = np.abs(expected).max()
     assert scale > 0.0
@@ -97,21 +108,19 @@ def one_step_error(course: Course, weights: Weights) -> float:
     return float(np.sqrt(np.concatenate(wrong).mean()))
 
 
-def test_training_learns_and_its_weights_run(box: Path, tmp_path: Path):
+def test_training_learns_and_its_weights_run(box: Path, course: Course, tmp_path: Path):
     data, out, picture = box / "data.h5", tmp_path / "w.npz", tmp_path / "w.png"
     vesselflow("train", data, "--out", out, "--iterations", "60", "--plot", picture)
     told = msgspec.json.decode(out.with_suffix(".history.json").read_bytes())
     assert told["validations"][-1]["iteration"] == 60
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert not list(tmp_path.glob("*.checkpoint*"))
-    with Dataset(data) as file:
-        course = Course(file, [0])
-        learned = one_step_error(course, Weights.load(out))
-        # What needs no training: a straight line through the 23 features, and nothing at all.
-        straight = one_step_error(course, ridge(course, Settings(head="direct")))
-        nothing = one_step_error(course, persistence(course, Settings(head="direct")))
-        assert learned < 0.7 * min(straight, nothing)
-        figures = course.rollout(course.pcnet(Weights.load(out)), course.held[0])
+    learned = one_step_error(course, Weights.load(out))
+    # What needs no training: a straight line through the 23 features, and nothing at all.
+    straight = one_step_error(course, ridge(course, Settings(head="direct")))
+    nothing = one_step_error(course, persistence(course, Settings(head="direct")))
+    assert learned < 0.7 * min(straight, nothing)
+    figures = course.rollout(course.pcnet(Weights.load(out)), course.held[0])
     assert figures["survived"] == 1.0
     # Blood that stands has compression from its own weight, g h/c^2 = 0.1 %, and from the layers'
     # settling; it must not collapse.
@@ -124,9 +133,9 @@ class KilledError(Exception):
     """Stands for whatever ends a training early."""
 
 
-def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path):
+def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, tmp_path):
     settings = Settings(iterations=20, validate_every=5)
-    data, whole, cut = box / "data.h5", tmp_path / "whole.npz", tmp_path / "cut.npz"
+    whole, cut = tmp_path / "whole.npz", tmp_path / "cut.npz"
 
     def quiet(_: Progress) -> None:
         pass
@@ -135,14 +144,14 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path)
         if at.iteration == 10:
             raise KilledError
 
-    train_weights(data, whole, settings, [0], report=quiet)
+    train_weights(course, whole, settings, report=quiet)
     with pytest.raises(KilledError):
-        train_weights(data, cut, settings, [0], report=kill)
+        train_weights(course, cut, settings, report=kill)
     checkpoint = tmp_path / "cut.npz.checkpoint"
     other = Settings(iterations=20, validate_every=5, seed=1)
     with pytest.raises(InputError, match=r"cut.npz.checkpoint: holds a training with seed 0"):
-        train_weights(data, cut, other, [0], report=quiet)
-    weights, history = train_weights(data, cut, settings, [0], report=quiet)
+        train_weights(course, cut, other, report=quiet)
+    weights, history = train_weights(course, cut, settings, report=quiet)
     assert not checkpoint.exists()
     assert [row["iteration"] for row in history] == [5, 10, 15, 20]
     expected = Weights.load(whole)
@@ -151,30 +160,25 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(box, tmp_path)
         np.testing.assert_array_equal(b, b_0)
     checkpoint.write_bytes(b"PK")
     with pytest.raises(InputError, match="not a checkpoint, or a cut one"):
-        train_weights(data, cut, settings, [0], report=quiet)
+        train_weights(course, cut, settings, report=quiet)
 
 
-def test_ridge_finds_a_straight_line(box, monkeypatch):
+def test_ridge_finds_a_straight_line(course, monkeypatch):
     """Targets that are linear in the features, with an offset, are met nearly exactly."""
-    with Dataset(box / "data.h5") as file:
-        course = Course(file, [0])
-        features, _ = course.examples(32)
-        line = np.random.default_rng(0).normal(size=(COUNT, 3)) / features[:, :COUNT].std(
-            axis=0, keepdims=True
-        ).T.clip(1e-3)
-        target = (features[:, :COUNT] @ line + 3.0) * course.scales.acceleration
-        monkeypatch.setattr(course, "examples", lambda _: (features, target))
-        weights = ridge(course, Settings(head="direct"))
+    features, _ = course.examples(32)
+    spread = features[:, :COUNT].std(axis=0, keepdims=True).T.clip(1e-3)
+    line = np.random.default_rng(0).normal(size=(COUNT, 3)) / spread
+    target = (features[:, :COUNT] @ line + 3.0) * course.scales.acceleration
+    monkeypatch.setattr(course, "examples", lambda _: (features, target))
+    weights = ridge(course, Settings(head="direct"))
     found = weights.evaluate(features[:, :COUNT]) * course.scales.acceleration
     # The penalty is a thousandth of a feature's variance.
     assert np.abs(found - target).max() < 0.02 * np.abs(target - target.mean(axis=0)).max()
 
 
-def test_persistence_gives_back_the_previous_acceleration(box):
-    with Dataset(box / "data.h5") as file:
-        course = Course(file, [0])
-        weights = persistence(course, Settings(head="direct"))
-        features, _ = course.examples(1)
+def test_persistence_gives_back_the_previous_acceleration(course):
+    weights = persistence(course, Settings(head="direct"))
+    features, _ = course.examples(1)
     np.testing.assert_allclose(
         weights.evaluate(features[:, :COUNT]), features[:, :3], rtol=1e-4, atol=1e-9
     )

@@ -1,0 +1,30 @@
+"""Models by name: what `--model` takes, and what is compared."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from taichi_sph.scene import Scene
+    from taichi_sph.simulation import ModelMaker
+
+MODELS = ("physics", "implicit", "pcnet")
+
+
+def maker_of(name: str, scene: "Scene", weights: Path | None = None) -> "ModelMaker":
+    """What makes a model for a scene; `weights` are of pcnet, by default as `weights_for`.
+
+    Raises:
+        InputError: weights that cannot be read.
+    """
+    if name == "implicit":
+        from taichi_sph.implicit import implicit_for
+
+        return implicit_for(scene)
+    if name == "pcnet":
+        from app.scenes import weights_for
+        from nn.pcnet import load_pcnet
+
+        return load_pcnet(weights or weights_for(scene), scene)
+    from taichi_sph.acceleration import SphAcceleration
+
+    return SphAcceleration
