@@ -1,0 +1,378 @@
+"""`vesselflow chart`: what each method costs against how far it is from a finer pour.
+
+Every method of `app.methods` pours the same column in a process of its own, since Taichi frees no
+field, one after the other.  Wall times are divided by what a small fixed loop took meanwhile, so
+that a machine that is busy now and then does not favour anyone.
+"""
+
+import math
+import multiprocessing
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.methods import FLOOR, METHODS, REFERENCE, Method, of_weights
+from app.metrics import RULES, Errors, Grid, Pour, Trace, errors_of
+from app.output import console, read_rows, write_rows
+from app.progress import duration
+from taichi_sph.errors import InputError
+from taichi_sph.scene import Scene
+
+CELL = 4.0
+"""Width of the coarse cells over the scene's spacing."""
+PROBES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+"""Step factors tried for the largest that lives, upwards until one dies; then once in between."""
+PANELS = {
+    "drained": "drained part, largest error [%]",
+    "field": "momentum on a coarse grid, mean error [%]",
+    "energy": "kinetic energy, largest error [%]",
+    "compression": "compression, 99th percentile [%]",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one scene."""
+
+    scene: str
+    until: float
+    """Simulated time [s]."""
+    method: str
+    curve: str
+    blood_particles: int
+    died: str
+    """Empty, or the rule that it broke."""
+    survived: float
+    """Part of the time that it lived."""
+    steps: int
+    step_factor: float
+    milliseconds_per_step: float
+    wall_per_simulated: float
+    """Wall seconds for a simulated second."""
+    yardstick: float
+    """What the fixed loop took meanwhile, median [ms]."""
+    leaks: int
+    path: float
+    drained: float
+    energy: float
+    field: float
+    compression: float
+    half_drained: float
+
+    @property
+    def at_rest(self) -> float:
+        """Wall seconds for a simulated second on a machine where the loop takes 1 ms."""
+        return self.wall_per_simulated / self.yardstick
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process of its own is told."""
+
+    scene: Scene
+    method: Method
+    until: float
+    reference: Path
+    arch: str
+    threads: int | None
+
+
+def _yardstick() -> Callable[[], float]:
+    """A loop that gathers and computes on all threads; calling it gives its wall time [ms]."""
+    import taichi as ti
+
+    n = 1 << 18
+    values = ti.field(float, n)
+
+    @ti.kernel
+    def gather() -> float:
+        total = 0.0
+        for i in range(n):
+            x = values[(i * 7919) % n] + float(i)
+            for _ in range(8):
+                x = ti.sqrt(x + 1.0)
+            total += x
+        return total
+
+    gather()
+
+    def measure() -> float:
+        before = time.perf_counter()
+        gather()
+        return 1e3 * (time.perf_counter() - before)
+
+    return measure
+
+
+def _grid_of(scene: Scene, simulation: Any) -> Grid:
+    """The coarse grid of a scene, the same for all methods."""
+    corners = simulation.vessel.vertices
+    return Grid.over(corners.min(axis=0), corners.max(axis=0), CELL * scene.discretization.spacing)
+
+
+def measure(job: Job) -> Row | Trace:
+    """Pour; needs a process of its own.  The reference's trace, or another method's row."""
+    from taichi_sph.runtime import start
+    from taichi_sph.simulation import Simulation
+
+    start(job.arch, "f32", job.threads)
+    method, interval = job.method, job.scene.frame_interval
+    scene = method.scene(job.scene)
+    simulation = Simulation.from_scene(scene, method.maker(scene))
+    is_reference = method == REFERENCE
+    grid = _grid_of(job.scene, simulation)
+    pour = Pour(method.name, simulation, Trace(interval), grid, None if is_reference else RULES)
+    tick, ticks = _yardstick(), []
+    for frame in range(1, round(job.until / interval) + 1):
+        pour.frame(frame * interval)
+        ticks.append(tick())
+        if pour.death or pour.empty:
+            break
+    if is_reference:
+        if pour.death:
+            raise InputError(f"{job.scene.name}: the reference itself died: {pour.death}")
+        return pour.trace
+    frames = round(job.until / interval)
+    errors = errors_of(pour.trace, load_trace(job.reference)) if pour.trace.drained else NOTHING
+    simulated = interval * (len(pour.seconds) - 1 if pour.death else frames - 1)
+    return Row(
+        scene=job.scene.name,
+        until=job.until,
+        method=method.name,
+        curve=method.curve,
+        blood_particles=simulation.derived.blood_particles,
+        died=pour.death,
+        survived=len(pour.seconds) / frames if pour.death else 1.0,
+        steps=simulation.steps,
+        step_factor=method.step_factor or 1.0,
+        milliseconds_per_step=pour.milliseconds_per_step,
+        wall_per_simulated=sum(pour.seconds[1:]) / simulated if simulated > 0.0 else math.nan,
+        yardstick=statistics.median(ticks),
+        leaks=pour.most_leaks,
+        **asdict(errors),
+    )
+
+
+NOTHING = Errors(*[math.nan] * len(fields(Errors)))
+
+
+def save_trace(path: Path, trace: Trace) -> None:
+    """Write a trace as .npz, whole or not at all."""
+    temporary = path.with_name(path.name + ".part")
+    with temporary.open("wb") as file:
+        arrays: dict[str, Any] = {k: np.asarray(v) for k, v in vars(trace).items()}
+        np.savez_compressed(file, **arrays)
+    temporary.replace(path)
+
+
+def load_trace(path: Path) -> Trace:
+    """What `save_trace` wrote."""
+    with np.load(path) as file:
+        found = {name: list(file[name]) for name in file.files if name != "frame_interval"}
+        return Trace(float(file["frame_interval"]), **found)
+
+
+def run(job: Job) -> Row | Trace:
+    """`measure` in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(measure, (job,))
+
+
+def measured(job: Job) -> Row:
+    """The row of a method; of its largest step that lives, if it asks for that."""
+    if job.method.step_factor is not None:
+        return _row(run(job))
+    best: Row | None = None
+    dead = math.inf
+
+    def probe(factor: float) -> Row:
+        return _row(run(replace(job, method=replace(job.method, step_factor=factor))))
+
+    for factor in PROBES:
+        row = probe(factor)
+        if row.died:
+            dead = factor
+            break
+        best = row
+    if best is None:
+        return row
+    if math.isfinite(dead):
+        row = probe(math.sqrt(best.step_factor * dead))
+        best = best if row.died else row
+    return best
+
+
+def _row(found: Row | Trace) -> Row:
+    assert isinstance(found, Row)
+    return found
+
+
+def main(
+    scenes: Sequence[Scene],
+    until: float | None,
+    out: Path,
+    weights: Sequence[Path],
+    only: str,
+    plot: Path | None,
+    arch: str,
+    threads: int | None,
+) -> None:
+    """Measure what is not yet in `out`, print what it says, and draw it.
+
+    Raises:
+        InputError: a scene or weights cannot be used, or `out` holds something else.
+    """
+    rows = read_rows(out, Row)
+    methods = [FLOOR, *METHODS, *(of_weights(path) for path in weights)]
+    for scene in scenes:
+        end = until or scene.duration
+        if round(end / scene.frame_interval) < 2:
+            raise InputError(
+                f"--until {end:g}: the first frame compiles and is not timed; give at least "
+                f"{2 * scene.frame_interval:g} s, two frames of {scene.name}"
+            )
+        reference = out.with_name(f"{out.stem}.{scene.name}.npz")
+        mine = [m for m in methods if only in m.name or m is FLOOR]
+        there = {row.method for row in rows if (row.scene, row.until) == (scene.name, end)}
+        left = [m for m in mine if m.name not in there]
+        if left and not reference.exists():
+            before = time.perf_counter()
+            trace = run(Job(scene, REFERENCE, end, reference, arch, threads))
+            assert isinstance(trace, Trace)
+            save_trace(reference, trace)
+            took = duration(time.perf_counter() - before)
+            print(f"{scene.name}: the reference took {took}", file=sys.stderr)
+        for method in left:
+            row = measured(Job(scene, method, end, reference, arch, threads))
+            rows.append(row)
+            write_rows(out, rows)
+            state = f"died ({row.died})" if row.died else f"drained {100 * row.drained:.1f} %"
+            print(
+                f"{scene.name}, {method.name}: {row.wall_per_simulated:.3g} s a simulated s, "
+                f"{state} ({len(rows)} rows)",
+                file=sys.stderr,
+            )
+    print_tables(rows)
+    if plot is not None:
+        draw(rows, plot)
+
+
+def front(rows: Sequence[Row], error: str) -> list[Row]:
+    """Rows that live and that nothing living beats in both cost and error, cheapest first."""
+    best, found = math.inf, []
+    for row in sorted((r for r in rows if not r.died), key=lambda r: r.at_rest):
+        if getattr(row, error) < best:
+            best = getattr(row, error)
+            found.append(row)
+    return found
+
+
+def rivals(rows: Sequence[Row], model: str, error: str) -> list[tuple[Row, Row]]:
+    """Each living row of a model with the cheapest one of the others that is as good."""
+    found = []
+    mine = [row for row in rows if row.curve.startswith(model) and not row.died]
+    others = [row for row in rows if not row.curve.startswith(model) and not row.died]
+    for row in mine:
+        as_good = [other for other in others if getattr(other, error) <= getattr(row, error)]
+        if as_good:
+            found.append((row, min(as_good, key=lambda other: other.at_rest)))
+    return found
+
+
+def print_tables(rows: Sequence[Row]) -> None:
+    """All rows, and each scene's front, for people."""
+    from rich.table import Table
+
+    unit = statistics.median(row.yardstick for row in rows) if rows else 1.0
+    for scene in dict.fromkeys(row.scene for row in rows):
+        mine = [row for row in rows if row.scene == scene]
+        table = Table(title=f"{scene}, {mine[0].until:g} s: errors against half the spacing [%]")
+        for heading in ("method", "blood", "steps", "wall s / s", *PANELS, "leaks", "died"):
+            table.add_column(heading, justify="left" if heading in ("method", "died") else "right")
+        for row in sorted(mine, key=lambda r: r.at_rest if r.at_rest == r.at_rest else math.inf):
+            name = row.method
+            if row.step_factor != 1.0:
+                name += f" ({row.step_factor:.3g} x)"
+            table.add_row(
+                name,
+                str(row.blood_particles),
+                str(row.steps),
+                f"{unit * row.at_rest:.3g}",
+                *(f"{100 * getattr(row, error):.2f}" for error in PANELS),
+                str(row.leaks),
+                f"{row.died} at {100 * row.survived:.0f} %" if row.died else "",
+            )
+        console().print(table)
+        usable = [row for row in mine if row.method != FLOOR.name]
+        for error, label in PANELS.items():
+            names = ", ".join(row.method for row in front(usable, error))
+            console().print(f"front, {label.partition(',')[0]}: {names}")
+            for model in ("pcnet", "implicit"):
+                for row, rival in rivals(usable, model, error):
+                    ratio = rival.at_rest / row.at_rest
+                    console().print(f"  {row.method}: {ratio:.2f} times faster than {rival.method}")
+
+
+COLOURS = {
+    "physics, spacing": "tab:blue",
+    "physics, sound speed": "tab:cyan",
+    "physics, longest step": "navy",
+    "physics, Newtonian": "tab:purple",
+    "implicit, spacing": "tab:green",
+    "implicit, rounds": "olive",
+    "ballistic": "black",
+    "pcnet, spacing": "tab:red",
+}
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Draw error over cost, a row of panels a scene."""
+    from matplotlib.figure import Figure
+
+    unit = statistics.median(row.yardstick for row in rows)
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    figure = Figure(figsize=(4.2 * len(PANELS), 4.2 * len(scenes) + 0.8), layout="constrained")
+    grid = figure.subplots(len(scenes), len(PANELS), squeeze=False)
+    curves = list(dict.fromkeys(row.curve for row in rows if row.curve))
+    spare = iter(("tab:orange", "tab:pink", "tab:brown", "tab:gray", "gold", "lime"))
+    colours = {curve: COLOURS.get(curve) or next(spare, "tab:gray") for curve in curves}
+    for line, scene in zip(grid, scenes, strict=True):
+        mine = [row for row in rows if row.scene == scene]
+        floor = next((row for row in mine if row.method == FLOOR.name), None)
+        for axes, (error, label) in zip(line, PANELS.items(), strict=True):
+            for curve in curves:
+                points = [row for row in mine if row.curve == curve]
+                # A curve's first point belongs to the plain model's other curves too.
+                plain = curve.partition(",")[0]
+                if curve in ("physics, sound speed", "implicit, rounds"):
+                    points += [row for row in mine if row.method == plain]
+                points.sort(key=lambda row: row.at_rest)
+                alive = [row for row in points if not row.died]
+                x = [unit * row.at_rest for row in alive]
+                y = [100.0 * getattr(row, error) for row in alive]
+                axes.plot(x, y, "o-", color=colours[curve], ms=5, label=curve)
+                for row in points:
+                    if row.died and math.isfinite(row.at_rest):
+                        axes.plot(
+                            unit * row.at_rest, 100.0 * getattr(row, error), "o",
+                            mfc="none", color=colours[curve], ms=7,
+                        )  # fmt: skip
+            axes.axvline(1.0, color="grey", lw=1, ls=":")
+            if floor is not None and error != "compression":
+                axes.axhline(100.0 * getattr(floor, error), color="grey", lw=1, ls="--")
+            axes.set(xscale="log", yscale="log", ylabel=label)
+            axes.set_title(scene if error == "drained" else "")
+            axes.set_xlabel("wall seconds for a simulated second")
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    figure.suptitle(
+        "left and low is better; hollow: died; dotted: real time; dashed: what the reference is "
+        "worth"
+    )
+    figure.savefig(path, dpi=110)

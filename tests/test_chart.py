@@ -1,0 +1,100 @@
+"""`vesselflow chart`: its fronts on rows that are known, and the command on a small tank."""
+
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from app.chart import PANELS, Row, front, load_trace, rivals
+from app.methods import METHODS, Method
+from app.output import read_rows, write_rows
+from app.scenes import find_scene
+from builders import vesselflow
+from taichi_sph.errors import InputError
+
+ROW = Row(
+    scene="A", until=0.1, method="physics", curve="physics, spacing", blood_particles=1000,
+    died="", survived=1.0, steps=100, step_factor=1.0, milliseconds_per_step=1.0,
+    wall_per_simulated=100.0, yardstick=2.0, leaks=0, path=0.01, drained=0.02, energy=0.01,
+    field=0.05, compression=0.01, half_drained=math.nan,
+)  # fmt: skip
+
+
+def row(method: str, wall: float, error: float, **changes: object) -> Row:
+    """A method with a cost [s/s] and an error."""
+    made = replace(ROW, method=method, curve=method, wall_per_simulated=wall, drained=error)
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+ROWS = [
+    row("physics", 100.0, 0.01),
+    row("coarse", 20.0, 0.05),
+    row("worse", 30.0, 0.06),
+    row("pcnet", 10.0, 0.04),
+    row("dead", 1.0, 0.001, died="it leaked"),
+]
+
+
+def test_the_front_has_what_nothing_living_beats():
+    assert [r.method for r in front(ROWS, "drained")] == ["pcnet", "physics"]
+
+
+def test_a_rival_is_the_cheapest_that_is_as_good():
+    ((mine, rival),) = rivals(ROWS, "pcnet", "drained")
+    assert (mine.method, rival.method) == ("pcnet", "physics")
+    assert rivals(ROWS[:1] + ROWS[3:], "physics", "drained") == []
+
+
+def test_cost_is_measured_in_what_the_machine_could_do_meanwhile():
+    busy = row("busy", 200.0, 0.01, yardstick=4.0)
+    assert busy.at_rest == ROWS[0].at_rest
+
+
+def test_rows_survive_the_file(tmp_path):
+    path = tmp_path / "chart.csv"
+    write_rows(path, ROWS)
+    again = read_rows(path, Row)
+    # NaN is not equal to itself.
+    assert [replace(r, half_drained=0.0) for r in again] == [
+        replace(r, half_drained=0.0) for r in ROWS
+    ]
+    path.write_text("scene,until\nA,0.1\n")
+    with pytest.raises(InputError, match=f"--out {path}: holds something else"):
+        read_rows(path, Row)
+    assert read_rows(tmp_path / "none.csv", Row) == []
+
+
+def test_methods_have_names_of_their_own_and_keep_the_volume_of_blood():
+    assert len({m.name for m in METHODS}) == len(METHODS)
+    scene = find_scene("A")
+    coarse = Method("x", "x", spacing=2.0, sound_speed_ratio=5.0, newtonian=True).scene(scene)
+    assert coarse.discretization.spacing == 2.0 * scene.discretization.spacing
+    assert coarse.discretization.sound_speed_ratio == 5.0
+    assert scene.column.particles is not None
+    assert coarse.column.particles == round(scene.column.particles / 8)
+    tank = find_scene("box")
+    assert Method("x", "x", spacing=2.0).scene(tank).column == tank.column
+    assert msgspec.structs.replace(tank) == Method("x", "x").scene(tank)
+
+
+def test_the_command_measures_draws_and_does_not_measure_twice(box: Path, tmp_path: Path):
+    out, picture = tmp_path / "chart.csv", tmp_path / "chart.png"
+    asked = ("chart", box, "--until", "0.02", "--only", "2 rounds", "--out", out)
+    told = vesselflow(*asked, "--plot", picture)
+    assert "implicit, 2 rounds" in told
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [r["method"] for r in rows] == ["spacing 2/3, c = 20 U", "implicit, 2 rounds"]
+    for r in rows:
+        assert not r["died"]
+        assert float(r["wall_per_simulated"]) > 0.0
+        assert all(float(r[error]) >= 0.0 for error in PANELS if error != "field")
+    (reference,) = tmp_path.glob("chart.*.npz")
+    assert len(load_trace(reference).drained) == 4
+    before = out.read_bytes()
+    vesselflow(*asked)
+    assert out.read_bytes() == before
