@@ -7,6 +7,7 @@ frames or blocks of steps, neighbour search included; nothing is logged or drawn
 import ctypes
 import importlib.util
 import json
+import math
 import multiprocessing
 import os
 import platform
@@ -15,17 +16,23 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from app.output import console, write_json
-from app.scenes import weights_for
+from app.scenes import weights_for, with_column
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene, parse_scene, read_scene
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+FRAMES_A_BLOCK = 10
+"""Steps of PcNet between two changes of side."""
 
 BLOCK = 20
 """Steps between two changes of side when two programs are timed in turn."""
@@ -76,24 +83,76 @@ def _in_own_process(work: Callable[..., Any], *args: Any) -> Any:
         return pool.apply(work, args)
 
 
-def measure_scene(path: Path, arch: str, threads: int | None, duration: float) -> Row:
-    """Cost of a step over the first `duration` [s] of a scene: median over its frames."""
+@dataclass(frozen=True)
+class Pair:
+    """A line of the paper's Table 1: physics and PcNet on one scene, poured in turn."""
+
+    scene: str
+    blood_particles: int
+    proxy_particles: int
+    particles: int
+    """Both."""
+    substeps: float
+    """Steps of the physics in one of PcNet."""
+    physics: Row
+    pcnet: Row
+    physics_frame_ms: float
+    """What the physics needs for the time of a PcNet step [ms]."""
+    pcnet_frame_ms: float
+    speed_up: float
+    paper_physics_ms: float
+    """The paper's figures for the same sizes on a GTX 650 Ti [ms]; NaN of another scene."""
+    paper_pcnet_ms: float
+
+
+PAPER = {
+    ("A", 16000): (26.0, 5.1),
+    ("A", 32000): (33.0, 6.3),
+    ("B", 16000): (30.0, 6.4),
+    ("B", 32000): (35.0, 7.4),
+}
+"""Table 1 of the paper: physics and PcNet [ms]."""
+
+
+def measure_scene(
+    path: Path, particles: int | None, arch: str, threads: int | None, duration: float
+) -> Pair:
+    """Cost of a step over the first `duration` [s] of a scene: medians over blocks."""
+    from nn.pcnet import load_pcnet
     from taichi_sph import Simulation, start
+    from taichi_sph.vessel import read_vessel
 
     start(arch, threads=threads)
-    scene = read_scene(path)
-    simulation = Simulation.from_scene(scene)
-    derived = simulation.derived
-    simulation.advance_to(2.0 * derived.step)  # compile
-    costs, before = [], time.perf_counter()
-    while simulation.time < duration and simulation.particles.count[None]:
-        steps = simulation.steps
-        before = time.perf_counter()
-        simulation.advance_to(simulation.time + 0.2 * scene.frame_interval)
-        costs.append((time.perf_counter() - before) / (simulation.steps - steps))
-    return _row(
-        scene.name, derived.blood_particles, derived.proxy_particles, costs, simulation.last_step
+    scene = with_column(read_scene(path), particles, None)
+    vessel = read_vessel(scene)
+    weights = load_pcnet(weights_for(scene), scene)
+    sides = [Simulation(scene, vessel), Simulation(scene, vessel, weights)]
+    frame = sides[1].model.stable_step(0.0, 0.0)
+    block = FRAMES_A_BLOCK * frame
+    costs: list[list[float]] = [[], []]
+    walls: list[list[float]] = [[], []]
+    for k in range(1, round(duration / block) + 1):
+        for side, cost, wall in zip(sides, costs, walls, strict=True):
+            steps, before = side.steps, time.perf_counter()
+            side.advance_to(k * block)
+            taken = time.perf_counter() - before
+            if k > 1:  # the first compiles
+                cost.append(taken / max(1, side.steps - steps))
+                wall.append(taken / FRAMES_A_BLOCK)
+        if not all(side.particles.count[None] for side in sides):
+            break
+    d = sides[0].derived
+    physics, pcnet = (
+        _row(f"{scene.name}, {side.model.name}", d.blood_particles, d.proxy_particles, cost, step)
+        for side, cost, step in zip(sides, costs, (sides[0].last_step, frame), strict=True)
     )
+    frames = [float(np.median(wall)) for wall in walls]
+    paper = PAPER.get((scene.name, d.blood_particles), (math.nan, math.nan))
+    return Pair(
+        scene.name, d.blood_particles, d.proxy_particles, d.blood_particles + d.proxy_particles,
+        sides[0].steps / sides[1].steps, physics, pcnet, 1e3 * frames[0], 1e3 * frames[1],
+        frames[0] / frames[1], *paper,
+    )  # fmt: skip
 
 
 def measure_split(path: Path, weights: Path, arch: str, threads: int | None) -> dict[str, float]:
@@ -347,11 +406,54 @@ def _machine(arch: str, threads: int | None) -> dict[str, Any]:
         "precision": "f32",
         "python": platform.python_version(),
         "taichi": ".".join(map(str, taichi.__version__)),
+        "commit": _commit(),
     }
 
 
+def _commit() -> str:
+    """Commit of the source tree; empty of an installed package."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    except OSError:
+        return ""
+
+
+def table_1(pairs: Sequence[Pair]) -> "Table":
+    """The paper's Table 1 with ours beside it; a frame is the time of a PcNet step."""
+    from rich.table import Table
+
+    table = Table(
+        title="a frame (one step of PcNet), neighbour search included; in brackets the paper's"
+    )
+    for heading in (
+        "scene", "blood", "proxies", "all", "physics ms", "PcNet ms", "speed-up", "sub-steps",
+        "real time, physics", "PcNet",
+    ):  # fmt: skip
+        table.add_column(heading, justify="left" if heading == "scene" else "right")
+    for p in pairs:
+        paper = (f" ({p.paper_physics_ms:.0f})", f" ({p.paper_pcnet_ms:.1f})")
+        ratio = f" ({p.paper_physics_ms / p.paper_pcnet_ms:.1f})"
+        if math.isnan(p.paper_pcnet_ms):
+            paper, ratio = ("", ""), ""
+        table.add_row(
+            p.scene,
+            str(p.blood_particles),
+            str(p.proxy_particles),
+            str(p.particles),
+            f"{p.physics_frame_ms:.1f}{paper[0]}",
+            f"{p.pcnet_frame_ms:.1f}{paper[1]}",
+            f"{p.speed_up:.2f}{ratio}",
+            f"{p.substeps:.1f}",
+            f"{p.physics.real_time_factor:.5f}",
+            f"{p.pcnet.real_time_factor:.5f}",
+        )
+    return table
+
+
 def main(
-    scenes: list[Path],
+    scenes: Sequence[tuple[Path, int | None]],
+    until: float = 0.1,
     arch: str = "cpu",
     threads: int | None = None,
     peer: bool = False,
@@ -372,9 +474,12 @@ def main(
     terminal = console()
     machine = _machine(arch, threads)
     terminal.print(", ".join(f"{key} {value}" for key, value in machine.items()))
-    rows: list[Row] = []
-    for path in scenes:
-        rows.append(_in_own_process(measure_scene, path, arch, threads, 0.1))
+    pairs: list[Pair] = []
+    for path, particles in scenes:
+        pairs.append(_in_own_process(measure_scene, path, particles, arch, threads, until))
+    rows: list[Row] = [row for pair in pairs for row in (pair.physics, pair.pcnet)]
+    if pairs:
+        terminal.print(table_1(pairs))
     notes = []
     if peer:
         ours, theirs = _in_own_process(measure_peer, threads)
@@ -385,7 +490,7 @@ def main(
             f"a particle-step of {row.case} costs "
             f"{row.microseconds_per_particle_step / theirs.microseconds_per_particle_step:.2f} "
             "of the peer's"
-            for row in rows[: len(scenes)]
+            for row in rows[: 2 * len(pairs)]
         ]
     if scale:
         sizes = [_in_own_process(measure_column, *s, arch, threads) for s in COLUMNS]
@@ -398,14 +503,14 @@ def main(
         )
     starts = {}
     if start_up:
-        for path in scenes:
+        for path in dict.fromkeys(path for path, _ in scenes):
             starts[str(path)] = measure_start(str(path), arch)
             cold, warm = starts[str(path)]
             name = read_scene(path).name
             notes.append(f"{name} to the first step: {cold:.1f} s cold, {warm:.1f} s warm")
     passes = {}
     if split:
-        for path in scenes:
+        for path in dict.fromkeys(path for path, _ in scenes):
             scene = read_scene(path)
             passes[scene.name] = _in_own_process(
                 measure_split, path, weights_for(scene), arch, threads
@@ -440,7 +545,8 @@ def main(
     for note in notes:
         terminal.print(note)
     if json_file:
-        result = {"machine": machine, "rows": [asdict(r) for r in rows], "starts": starts}
+        result = {"machine": machine, "table": [asdict(p) for p in pairs]}
+        result |= {"rows": [asdict(r) for r in rows], "starts": starts}
         result["passes"] = passes
         write_json(json_file, result)
     return 0

@@ -249,7 +249,11 @@ def main(
             took = duration(time.perf_counter() - before)
             print(f"{scene.name}: the reference took {took}", file=sys.stderr)
         for method in left:
-            row = measured(Job(scene, method, end, reference, arch, threads))
+            try:
+                row = measured(Job(scene, method, end, reference, arch, threads))
+            except InputError as error:  # too coarse for the vessel, say
+                print(f"{scene.name}, {method.name}: left out: {error}", file=sys.stderr)
+                continue
             rows.append(row)
             write_rows(out, rows)
             state = f"died ({row.died})" if row.died else f"drained {100 * row.drained:.1f} %"
@@ -324,6 +328,7 @@ COLOURS = {
     "physics, sound speed": "tab:cyan",
     "physics, longest step": "navy",
     "physics, Newtonian": "tab:purple",
+    "soft physics, spacing": "darkorange",
     "implicit, spacing": "tab:green",
     "implicit, rounds": "olive",
     "ballistic": "black",
@@ -331,13 +336,27 @@ COLOURS = {
 }
 
 
+def verdict(rows: Sequence[Row], error: str) -> str:
+    """How the network stands where it stands best, against the cheapest that is as good."""
+    pairs = rivals(rows, "pcnet", error)
+    best = front(rows, error)
+    alone = [row for row in best if row.curve.startswith("pcnet")]
+    if not alone:
+        return "PcNet is not on the front"
+    ratios = [rival.at_rest / row.at_rest for row, rival in pairs if row in alone]
+    if not ratios:
+        return "PcNet on the front"
+    return f"PcNet on the front: up to {max(ratios):.2g} x the next as good"
+
+
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw error over cost, a row of panels a scene."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     unit = statistics.median(row.yardstick for row in rows)
     scenes = list(dict.fromkeys(row.scene for row in rows))
-    figure = Figure(figsize=(4.2 * len(PANELS), 4.2 * len(scenes) + 0.8), layout="constrained")
+    figure = Figure(figsize=(4.4 * len(PANELS), 4.2 * len(scenes) + 1.0), layout="constrained")
     grid = figure.subplots(len(scenes), len(PANELS), squeeze=False)
     curves = list(dict.fromkeys(row.curve for row in rows if row.curve))
     spare = iter(("tab:orange", "tab:pink", "tab:brown", "tab:gray", "gold", "lime"))
@@ -345,34 +364,42 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     for line, scene in zip(grid, scenes, strict=True):
         mine = [row for row in rows if row.scene == scene]
         floor = next((row for row in mine if row.method == FLOOR.name), None)
+        usable = [row for row in mine if row is not floor]
         for axes, (error, label) in zip(line, PANELS.items(), strict=True):
             for curve in curves:
-                points = [row for row in mine if row.curve == curve]
-                # A curve's first point belongs to the plain model's other curves too.
-                plain = curve.partition(",")[0]
+                points = [row for row in usable if row.curve == curve]
                 if curve in ("physics, sound speed", "implicit, rounds"):
-                    points += [row for row in mine if row.method == plain]
-                points.sort(key=lambda row: row.at_rest)
+                    # The plain model is a point of these curves too.
+                    plain = curve.partition(",")[0]
+                    points = [row for row in usable if row.method == plain] + points
                 alive = [row for row in points if not row.died]
                 x = [unit * row.at_rest for row in alive]
                 y = [100.0 * getattr(row, error) for row in alive]
-                axes.plot(x, y, "o-", color=colours[curve], ms=5, label=curve)
+                style = "o:" if curve == "ballistic" else "o-"
+                axes.plot(x, y, style, color=colours[curve], ms=5, label=curve)
                 for row in points:
                     if row.died and math.isfinite(row.at_rest):
+                        # What it got wrong until it died says nothing.
                         axes.plot(
-                            unit * row.at_rest, 100.0 * getattr(row, error), "o",
-                            mfc="none", color=colours[curve], ms=7,
+                            unit * row.at_rest, 0.97, "o", mfc="none", color=colours[curve], ms=7,
+                            transform=axes.get_xaxis_transform(),
                         )  # fmt: skip
             axes.axvline(1.0, color="grey", lw=1, ls=":")
             if floor is not None and error != "compression":
                 axes.axhline(100.0 * getattr(floor, error), color="grey", lw=1, ls="--")
             axes.set(xscale="log", yscale="log", ylabel=label)
-            axes.set_title(scene if error == "drained" else "")
+            axes.margins(y=0.15)
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+                axis.set_minor_formatter(NullFormatter())
+            name = f"{scene}: " if error == "drained" else ""
+            axes.set_title(f"{name}{verdict(usable, error)}", fontsize=9)
             axes.set_xlabel("wall seconds for a simulated second")
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     figure.suptitle(
-        "left and low is better; hollow: died; dotted: real time; dashed: what the reference is "
-        "worth"
+        "left and low is better; hollow at the top: died; dotted: real time; dashed: what the "
+        "reference is worth"
     )
     figure.savefig(path, dpi=110)

@@ -14,7 +14,6 @@ from taichi_sph.errors import InputError, RunError
 
 if TYPE_CHECKING:
     from app.drive import Summary
-    from taichi_sph.scene import Scene
 
 EPILOG = "All quantities are in SI units. Exit codes: 0 done, 1 the run diverged, 2 wrong input."
 LIVE_PORT = 9876
@@ -147,7 +146,7 @@ def run(
 ) -> int:
     """Simulate a scene."""
     from app.output import check_output, write_json
-    from app.scenes import find_scene
+    from app.scenes import find_scene, with_column
 
     if frames is not None and until is not None:
         raise InputError("--frames and --until: give one of the two")
@@ -191,18 +190,6 @@ def run(
     if outcome.error:
         raise outcome.error
     return 128 + outcome.signal if outcome.signal else 0
-
-
-def with_column(scene: "Scene", particles: int | None, height: float | None) -> "Scene":
-    """The scene with another column, where one is asked for."""
-    import msgspec
-
-    if particles is None and height is None:
-        return scene
-    if particles is not None and height is not None:
-        raise InputError("--particles and --height: give one of the two")
-    column = msgspec.structs.replace(scene.column, particles=particles, height=height)
-    return msgspec.structs.replace(scene, column=column)
 
 
 def summary_text(summary: "Summary") -> str:
@@ -422,6 +409,14 @@ def validate(
 
 @cli.command()
 @click.argument("scene_names", metavar="[SCENE]...", nargs=-1)
+@click.option(
+    "--until",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    default=0.1,
+    show_default=True,
+    help="Simulated time of each scene [s].",
+)
 @arch_option
 @threads_option
 @click.option("--peer", is_flag=True, help="Measure SPlisHSPlasH beside, on a like column.")
@@ -433,6 +428,7 @@ def validate(
 )
 def bench(
     scene_names: tuple[str, ...],
+    until: float,
     arch: str,
     threads: int | None,
     peer: bool,
@@ -441,15 +437,17 @@ def bench(
     split: bool,
     json_file: Path | None,
 ) -> int:
-    """Measure the speed on scenes (A by default)."""
+    """Measure the speed on scenes; without any, the paper's Table 1: A and B, 16 000 and 32 000."""
     from app import bench as benchmark
     from app.output import check_output
     from app.scenes import scene_path
 
     if json_file is not None:
         check_output(json_file, "--json", b"{")
-    scenes = [scene_path(name) for name in scene_names or ("A",)]
-    return benchmark.main(scenes, arch, threads, peer, scale, start_up, split, json_file)
+    scenes: list[tuple[Path, int | None]] = [(scene_path(name), None) for name in scene_names]
+    if not scenes:
+        scenes = [(scene_path(name), count) for name in "AB" for count in (16000, 32000)]
+    return benchmark.main(scenes, until, arch, threads, peer, scale, start_up, split, json_file)
 
 
 @cli.command()
@@ -534,7 +532,7 @@ def compare(
     from app import compare as comparison
     from app.learn import check_plot
     from app.output import check_output
-    from app.scenes import find_scene, weights_for
+    from app.scenes import find_scene, weights_for, with_column
     from taichi_sph.runtime import start
 
     scene = with_column(find_scene(scene_name), particles, height)
@@ -558,6 +556,12 @@ def compare(
     "--height", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="Column [m]."
 )
 @click.option(
+    "--spacing",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="METRES",
+    help="Spacing of the plain method [m], instead of the scene's.",
+)
+@click.option(
     "--until",
     type=click.FloatRange(min=0, min_open=True),
     metavar="SECONDS",
@@ -578,6 +582,7 @@ def chart(
     out: Path,
     plot: Path | None,
     height: float | None,
+    spacing: float | None,
     until: float | None,
     weights: tuple[Path, ...],
     only: str,
@@ -593,15 +598,20 @@ def chart(
     from app import chart as charting
     from app.learn import check_plot
     from app.output import check_output
-    from app.scenes import find_scene
+    from app.scenes import find_scene, with_column
 
     check_output(out, "--out", b"scene,")
     check_plot(plot)
     scenes = []
     for name in scene_names:
         scene = with_column(find_scene(name), None, height)
+        grid, label = scene.discretization, scene.name
+        if spacing is not None:
+            grid = msgspec.structs.replace(grid, spacing=spacing)
+            label += f"-d{1e3 * spacing:g}mm"
         if height is not None:
-            scene = msgspec.structs.replace(scene, name=f"{scene.name}-{1e3 * height:g}mm")
+            label += f"-{1e3 * height:g}mm"
+        scene = msgspec.structs.replace(scene, name=label, discretization=grid)
         scenes.append(scene)
     charting.main(scenes, until, out, weights, only, plot, arch, threads)
     return 0

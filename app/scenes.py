@@ -4,6 +4,7 @@ import difflib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 from rich.table import Table
 
 from taichi_sph.errors import InputError
@@ -70,6 +71,20 @@ def find_scene(given: str) -> Scene:
         InputError: there is no such scene, or its file has a mistake.
     """
     return read_scene(scene_path(given))
+
+
+def with_column(scene: Scene, particles: int | None, height: float | None) -> Scene:
+    """The scene with another column, where one is asked for.
+
+    Raises:
+        InputError: both are asked for.
+    """
+    if particles is None and height is None:
+        return scene
+    if particles is not None and height is not None:
+        raise InputError("--particles and --height: give one of the two")
+    column = msgspec.structs.replace(scene.column, particles=particles, height=height)
+    return msgspec.structs.replace(scene, column=column)
 
 
 def weights_for(scene: Scene) -> Path:

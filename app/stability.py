@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from app.methods import Method, of_weights
+from app.methods import SOFT, Method, of_weights
 from app.metrics import RULES, Pour, Trace
 from app.output import console, read_rows, write_rows
 from app.scenes import find_scene
@@ -279,8 +279,8 @@ CASES: tuple[Case, ...] = (
 METHODS: tuple[Method, ...] = (
     Method("physics", "physics"),
     Method("physics, 2 x step", "physics", step_factor=2.0),
-    Method("physics, c = 5 U", "physics", sound_speed_ratio=5.0),
     Method("physics, c = 3 U", "physics", sound_speed_ratio=3.0),
+    SOFT,
     Method("physics, printed integrator", "physics", integrator="paper"),
     Method("implicit", "implicit", "implicit"),
     Method("implicit, 4 rounds", "implicit", "implicit", rounds=4),

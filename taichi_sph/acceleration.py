@@ -62,6 +62,8 @@ class Fluid:
     calibration: Calibration
     artificial_viscosity: float
     """Monaghan's alpha [-]."""
+    courant_number: float = 0.4
+    """Step over h_s/(c + v) [-]."""
     nested: bool = False
     """Viscous stress in the paper's nested form (Eqs. 10 and 12)."""
 
@@ -117,12 +119,12 @@ class SphAcceleration:
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """Smallest of the sound, viscous and force limits [s].
 
-        0.4 h_s/(c + v), 0.125 h_s^2 rho/mu, 0.25 sqrt(h_s/a): Monaghan 1992 and Morris et al.
-        1997, doi:10.1006/jcph.1997.5776, section 3.5.
+        C h_s/(c + v), 0.125 h_s^2 rho/mu, 0.25 sqrt(h_s/a): Monaghan 1992 (C = 0.4) and Morris
+        et al. 1997, doi:10.1006/jcph.1997.5776, section 3.5.
         """
         h = self.fluid.kernel.smoothing_length
         state = self.fluid.state
-        step = 0.4 * h / (state.sound_speed + largest_speed)
+        step = self.fluid.courant_number * h / (state.sound_speed + largest_speed)
         step = min(step, 0.125 * h * h * state.rest_density / self.fluid.rheology.largest_viscosity)
         if largest_acceleration > 0.0:
             step = min(step, 0.25 * (h / largest_acceleration) ** 0.5)

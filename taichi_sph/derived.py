@@ -49,7 +49,9 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
     sound = grid.sound_speed_ratio * (speed or 1.0)
     h = 0.5 * radius
     viscosity = rheology_of(scene.blood.rheology).largest_viscosity
-    step = min(0.4 * h / (sound + speed), 0.125 * h * h * scene.blood.density / viscosity)
+    step = min(
+        grid.courant_number * h / (sound + speed), 0.125 * h * h * scene.blood.density / viscosity
+    )
     narrowest = 2.0 * min((o.radius for o in vessel.openings), default=math.nan)
     return Derived(
         blood_particles=blood_count,

@@ -107,6 +107,9 @@ class Discretization(_Table):
     """Spacing of the wall's proxy particles over that of blood [-]."""
     sound_speed_ratio: Annotated[float, msgspec.Meta(ge=2.0, le=100.0)] = 10.0
     """Sound speed over the largest speed that the drop allows [-]; 10 keeps density to 1 %."""
+    courant_number: Annotated[float, msgspec.Meta(gt=0, le=2.0)] = 0.4
+    """Step of the physics over R/2/(c + v) [-]: the textbook's; with more damping longer ones
+    live, see docs/evidence.md."""
     integrator: Literal["symplectic", "paper"] = "symplectic"
     """Semi-implicit Euler, or Eqs. 17 and 18 as printed (unstable: for study only)."""
     viscous_form: Literal["pairwise", "nested"] = "pairwise"

@@ -89,6 +89,7 @@ class Simulation(Motion):
             rheology=rheology_of(scene.blood.rheology),
             calibration=calibration,
             artificial_viscosity=scene.blood.artificial_viscosity,
+            courant_number=grid.courant_number,
             nested=grid.viscous_form == "nested",
         )
         particles = Particles.from_numpy(blood, mass=scene.blood.density * grid.spacing**3)
