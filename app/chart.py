@@ -328,7 +328,7 @@ COLOURS = {
     "physics, sound speed": "tab:cyan",
     "physics, longest step": "navy",
     "physics, Newtonian": "tab:purple",
-    "soft physics, spacing": "darkorange",
+    "soft physics, spacing": "magenta",
     "implicit, spacing": "tab:green",
     "implicit, rounds": "olive",
     "ballistic": "black",
@@ -338,6 +338,8 @@ COLOURS = {
 
 def verdict(rows: Sequence[Row], error: str) -> str:
     """How the network stands where it stands best, against the cheapest that is as good."""
+    if not any(getattr(row, error) for row in rows if not row.died):
+        return "all agree"
     pairs = rivals(rows, "pcnet", error)
     best = front(rows, error)
     alone = [row for row in best if row.curve.startswith("pcnet")]
