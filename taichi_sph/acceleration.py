@@ -62,10 +62,10 @@ class Fluid:
     calibration: Calibration
     artificial_viscosity: float
     """Monaghan's alpha [-]."""
-    courant_number: float = 0.4
-    """Step over h_s/(c + v) [-]."""
     nested: bool = False
     """Viscous stress in the paper's nested form (Eqs. 10 and 12)."""
+    courant_number: float = 0.4
+    """Step over h_s/(c + v) [-]."""
 
     @property
     def softening(self) -> float:

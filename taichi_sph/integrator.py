@@ -65,7 +65,7 @@ def kick_drift(
             x += 0.5 * (v + v_new) * dt
         else:
             x += v_new * dt
-        near2 = ti.static((0.75 * w.spacing) ** 2)
+        near2 = ti.static((1.1 * w.spacing) ** 2)
         limit = ti.static(-(1.0 + WALL_MARGIN) * w.setback)
         side = ti.static(-(1.0 - WALL_SIDE) * w.setback)
         touched = 0

@@ -38,7 +38,7 @@ MISTAKES = {
         "spacing = 1e-3",
         "spacing = 1e-3\nsupport = 2.0",
         "scene.toml: discretization: unknown key support; allowed: spacing, support_ratio, "
-        "wall_spacing_ratio, sound_speed_ratio, integrator, viscous_form",
+        "wall_spacing_ratio, sound_speed_ratio, courant_number, integrator, viscous_form",
     ),
     "unknown key at the top": (
         "duration = 0.1",
