@@ -65,7 +65,8 @@ def kick_drift(
             x += 0.5 * (v + v_new) * dt
         else:
             x += v_new * dt
-        near2 = ti.static((1.1 * w.spacing) ** 2)
+        near2 = ti.static((0.75 * w.spacing) ** 2)
+        aside2 = ti.static((1.1 * w.spacing) ** 2)
         limit = ti.static(-(1.0 + WALL_MARGIN) * w.setback)
         side = ti.static(-(1.0 - WALL_SIDE) * w.setback)
         touched = 0
@@ -75,9 +76,13 @@ def kick_drift(
             normal = w.normal[k]
             depth = r_ik.dot(normal)
             before = nb.grid.separation(x_old, w.position[k]).dot(normal)
-            # Only proxies straight behind the particle: their plane is the wall there.
-            beside = r_ik.norm_sqr() - depth * depth < near2
-            if depth > limit and before < side and beside:
+            # Proxies straight behind the particle: their plane is the wall there.  At an edge none
+            # may be; those a little aside then hold what has reached the surface itself.
+            aside = r_ik.norm_sqr() - depth * depth
+            beyond = (depth > limit and aside < near2) or (
+                depth > ti.static(-w.setback) and aside < aside2
+            )
+            if beyond and before < side:
                 x -= (depth - limit) * normal
                 v_new -= ti.max(0.0, v_new.dot(normal)) * normal
                 touched = 1
