@@ -174,8 +174,7 @@ class Step:
     acceleration: torch.Tensor
     """[m/s^2], (n, 3)"""
     thickness: torch.Tensor | None = None
-    """ln(mu/eta), (n,), learned from the physics' viscosity: accelerations teach none, for what
-    they have of noise too much of it would damp."""
+    """ln(mu/eta), (n,), learned from the physics' own viscosity: accelerations hardly teach it."""
     compression: torch.Tensor | None = None
     """max(rho/rho_0 - 1, 0) that is left at the end of the step, (n,)."""
 
