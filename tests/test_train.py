@@ -163,6 +163,14 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, tmp_pa
         train_weights(course, cut, settings, report=quiet)
 
 
+def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
+    """The physics takes four steps a frame; rolled out from the first frame it is the recording."""
+    figures = course.rollout(course.stage.physics, course.held[0])
+    assert figures["survived"] == 1.0
+    # Of a way of some tenths of a spacing; behind in time by half it would be 0.75 off.
+    assert figures["path_error"] < 0.1
+
+
 def test_ridge_finds_a_straight_line(course, monkeypatch):
     """Targets that are linear in the features, with an offset, are met nearly exactly."""
     features, _ = course.examples(32)
