@@ -8,7 +8,6 @@ import ctypes
 import importlib.util
 import json
 import math
-import multiprocessing
 import os
 import platform
 import resource
@@ -23,7 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.output import console, write_json
+from app.output import console, table, write_json
+from app.processes import in_own_process
 from app.scenes import weights_for, with_column
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene, parse_scene, read_scene
@@ -76,13 +76,6 @@ def _row(case: str, blood: int, proxies: int, steps: list[float], dt: float) -> 
     )
 
 
-def _in_own_process(work: Callable[..., Any], *args: Any) -> Any:
-    """Result of a function called in a fresh process."""
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(1) as pool:
-        return pool.apply(work, args)
-
-
 @dataclass(frozen=True)
 class Pair:
     """A line of the paper's Table 1: physics and PcNet on one scene, poured in turn."""
@@ -129,6 +122,11 @@ def measure_scene(
     sides = [Simulation(scene, vessel), Simulation(scene, vessel, weights)]
     frame = sides[1].model.stable_step(0.0, 0.0)
     block = FRAMES_A_BLOCK * frame
+    if round(duration / block) < 2:
+        raise InputError(
+            f"--until {duration:g}: the first {FRAMES_A_BLOCK} steps of PcNet compile and are not "
+            f"timed; give at least {2.0 * block:.2g} s for {scene.name}"
+        )
     costs: list[list[float]] = [[], []]
     walls: list[list[float]] = [[], []]
     for k in range(1, round(duration / block) + 1):
@@ -421,22 +419,17 @@ def _commit() -> str:
 
 def table_1(pairs: Sequence[Pair]) -> "Table":
     """The paper's Table 1 with ours beside it; a frame is the time of a PcNet step."""
-    from rich.table import Table
-
-    table = Table(
-        title="a frame (one step of PcNet), neighbour search included; in brackets the paper's"
-    )
-    for heading in (
+    found = table(
+        "a frame (one step of PcNet), neighbour search included; in brackets the paper's",
         "scene", "blood", "proxies", "all", "physics ms", "PcNet ms", "speed-up", "sub-steps",
         "real time, physics", "PcNet",
-    ):  # fmt: skip
-        table.add_column(heading, justify="left" if heading == "scene" else "right")
+    )  # fmt: skip
     for p in pairs:
         paper = (f" ({p.paper_physics_ms:.0f})", f" ({p.paper_pcnet_ms:.1f})")
         ratio = f" ({p.paper_physics_ms / p.paper_pcnet_ms:.1f})"
         if math.isnan(p.paper_pcnet_ms):
             paper, ratio = ("", ""), ""
-        table.add_row(
+        found.add_row(
             p.scene,
             str(p.blood_particles),
             str(p.proxy_particles),
@@ -448,7 +441,7 @@ def table_1(pairs: Sequence[Pair]) -> "Table":
             f"{p.physics.real_time_factor:.5f}",
             f"{p.pcnet.real_time_factor:.5f}",
         )
-    return table
+    return found
 
 
 def main(
@@ -465,10 +458,8 @@ def main(
     """Measure and print; returns the exit code.
 
     Raises:
-        InputError: the peer is asked for and not installed.
+        InputError: the peer is asked for and not installed, or the time is too short.
     """
-    from rich.table import Table
-
     if peer and not has_peer():
         raise InputError("--peer: pysplishsplash is not installed; pip install 'vesselflow[peer]'")
     terminal = console()
@@ -476,13 +467,13 @@ def main(
     terminal.print(", ".join(f"{key} {value}" for key, value in machine.items()))
     pairs: list[Pair] = []
     for path, particles in scenes:
-        pairs.append(_in_own_process(measure_scene, path, particles, arch, threads, until))
+        pairs.append(in_own_process(measure_scene, path, particles, arch, threads, until))
     rows: list[Row] = [row for pair in pairs for row in (pair.physics, pair.pcnet)]
     if pairs:
         terminal.print(table_1(pairs))
     notes = []
     if peer:
-        ours, theirs = _in_own_process(measure_peer, threads)
+        ours, theirs = in_own_process(measure_peer, threads)
         rows += [ours, theirs]
         ratio = ours.microseconds_per_particle_step / theirs.microseconds_per_particle_step
         notes.append(f"a particle-step of the column costs {ratio:.2f} of the peer's")
@@ -493,7 +484,7 @@ def main(
             for row in rows[: 2 * len(pairs)]
         ]
     if scale:
-        sizes = [_in_own_process(measure_column, *s, arch, threads) for s in COLUMNS]
+        sizes = [in_own_process(measure_column, *s, arch, threads) for s in COLUMNS]
         rows += sizes
         costs = [row.microseconds_per_particle_step for row in sizes]
         notes.append(
@@ -512,26 +503,18 @@ def main(
     if split:
         for path in dict.fromkeys(path for path, _ in scenes):
             scene = read_scene(path)
-            passes[scene.name] = _in_own_process(
+            passes[scene.name] = in_own_process(
                 measure_split, path, weights_for(scene), arch, threads
             )
             notes += [
                 f"{scene.name}, {name}: {ms:.2f} ms" for name, ms in passes[scene.name].items()
             ]
-    table = Table(title="cost of a step, neighbour search included")
-    for heading in (
-        "case",
-        "blood",
-        "proxies",
-        "step ms",
-        "quartiles",
-        "us/particle",
-        "real time",
-        "MiB",
-    ):
-        table.add_column(heading, justify="left" if heading == "case" else "right")
+    costs_table = table(
+        "cost of a step, neighbour search included",
+        "case", "blood", "proxies", "step ms", "quartiles", "us/particle", "real time", "MiB",
+    )  # fmt: skip
     for row in rows:
-        table.add_row(
+        costs_table.add_row(
             row.case,
             str(row.blood_particles),
             str(row.proxy_particles),
@@ -541,7 +524,7 @@ def main(
             f"{row.real_time_factor:.5f}",
             f"{row.memory_mib:.0f}",
         )
-    terminal.print(table)
+    terminal.print(costs_table)
     for note in notes:
         terminal.print(note)
     if json_file:

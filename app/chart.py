@@ -6,7 +6,6 @@ that a machine that is busy now and then does not favour anyone.
 """
 
 import math
-import multiprocessing
 import statistics
 import sys
 import time
@@ -18,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from app.methods import FLOOR, METHODS, REFERENCE, Method, of_weights
-from app.metrics import RULES, Errors, Grid, Pour, Trace, errors_of
-from app.output import console, read_rows, write_rows
+from app.metrics import RULES, Errors, Grid, Pour, Rules, Trace, errors_of
+from app.output import console, read_rows, table, write_rows
+from app.processes import in_own_process
 from app.progress import duration
-from taichi_sph.errors import InputError
+from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene
 
 CELL = 4.0
@@ -82,6 +82,11 @@ class Job:
     arch: str
     threads: int | None
 
+    @property
+    def frames(self) -> int:
+        """Frames to the end."""
+        return round(self.until / self.scene.frame_interval)
+
 
 def _yardstick() -> Callable[[], float]:
     """A loop that gathers and computes on all threads; calling it gives its wall time [ms]."""
@@ -116,45 +121,59 @@ def _grid_of(scene: Scene, simulation: Any) -> Grid:
     return Grid.over(corners.min(axis=0), corners.max(axis=0), CELL * scene.discretization.spacing)
 
 
-def measure(job: Job) -> Row | Trace:
-    """Pour; needs a process of its own.  The reference's trace, or another method's row."""
+def pour(job: Job, rules: Rules | None) -> tuple[Pour, float]:
+    """Pour; needs a process of its own.  With what the yardstick took meanwhile, median [ms]."""
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
 
     start(job.arch, "f32", job.threads)
-    method, interval = job.method, job.scene.frame_interval
-    scene = method.scene(job.scene)
-    simulation = Simulation.from_scene(scene, method.maker(scene))
-    is_reference = method == REFERENCE
+    interval = job.scene.frame_interval
+    scene = job.method.scene(job.scene)
+    simulation = Simulation.from_scene(scene, job.method.maker(scene))
     grid = _grid_of(job.scene, simulation)
-    pour = Pour(method.name, simulation, Trace(interval), grid, None if is_reference else RULES)
+    poured = Pour(job.method.name, simulation, Trace(interval), grid, rules)
     tick, ticks = _yardstick(), []
-    for frame in range(1, round(job.until / interval) + 1):
-        pour.frame(frame * interval)
+    for frame in range(1, job.frames + 1):
+        poured.frame(frame * interval)
         ticks.append(tick())
-        if pour.death or pour.empty:
+        if poured.death or poured.empty:
             break
-    if is_reference:
-        if pour.death:
-            raise InputError(f"{job.scene.name}: the reference itself died: {pour.death}")
-        return pour.trace
-    frames = round(job.until / interval)
-    errors = errors_of(pour.trace, load_trace(job.reference)) if pour.trace.drained else NOTHING
-    simulated = interval * (len(pour.seconds) - 1 if pour.death else frames - 1)
+    return poured, statistics.median(ticks)
+
+
+def refer(job: Job) -> Trace:
+    """The reference's trace; needs a process of its own.
+
+    Raises:
+        RunError: it died.
+    """
+    poured, _ = pour(job, None)
+    if poured.death:
+        raise RunError(f"{job.scene.name}: the reference itself died: {poured.death}")
+    return poured.trace
+
+
+def measure(job: Job) -> Row:
+    """A method's row; needs a process of its own."""
+    poured, yardstick = pour(job, RULES)
+    simulation, lived = poured.simulation, len(poured.seconds)
+    errors = errors_of(poured.trace, load_trace(job.reference)) if lived else NOTHING
+    # An empty vessel costs nothing for the rest of the time.
+    simulated = job.scene.frame_interval * ((lived if poured.death else job.frames) - 1)
     return Row(
         scene=job.scene.name,
         until=job.until,
-        method=method.name,
-        curve=method.curve,
+        method=job.method.name,
+        curve=job.method.curve,
         blood_particles=simulation.derived.blood_particles,
-        died=pour.death,
-        survived=len(pour.seconds) / frames if pour.death else 1.0,
+        died=poured.death,
+        survived=lived / job.frames if poured.death else 1.0,
         steps=simulation.steps,
-        step_factor=method.step_factor or 1.0,
-        milliseconds_per_step=pour.milliseconds_per_step,
-        wall_per_simulated=sum(pour.seconds[1:]) / simulated if simulated > 0.0 else math.nan,
-        yardstick=statistics.median(ticks),
-        leaks=pour.most_leaks,
+        step_factor=job.method.step_factor or 1.0,
+        milliseconds_per_step=poured.milliseconds_per_step,
+        wall_per_simulated=sum(poured.seconds[1:]) / simulated if simulated > 0.0 else math.nan,
+        yardstick=yardstick,
+        leaks=poured.most_leaks,
         **asdict(errors),
     )
 
@@ -178,39 +197,24 @@ def load_trace(path: Path) -> Trace:
         return Trace(float(file["frame_interval"]), **found)
 
 
-def run(job: Job) -> Row | Trace:
-    """`measure` in a process of its own."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(measure, (job,))
-
-
 def measured(job: Job) -> Row:
     """The row of a method; of its largest step that lives, if it asks for that."""
-    if job.method.step_factor is not None:
-        return _row(run(job))
-    best: Row | None = None
-    dead = math.inf
 
     def probe(factor: float) -> Row:
-        return _row(run(replace(job, method=replace(job.method, step_factor=factor))))
+        return in_own_process(measure, replace(job, method=replace(job.method, step_factor=factor)))
 
+    if job.method.step_factor is not None:
+        return probe(job.method.step_factor)
+    best: Row | None = None
     for factor in PROBES:
         row = probe(factor)
         if row.died:
-            dead = factor
             break
         best = row
-    if best is None:
+    if best is None or not row.died:
         return row
-    if math.isfinite(dead):
-        row = probe(math.sqrt(best.step_factor * dead))
-        best = best if row.died else row
-    return best
-
-
-def _row(found: Row | Trace) -> Row:
-    assert isinstance(found, Row)
-    return found
+    between = probe(math.sqrt(best.step_factor * row.step_factor))
+    return best if between.died else between
 
 
 def main(
@@ -226,10 +230,16 @@ def main(
     """Measure what is not yet in `out`, print what it says, and draw it.
 
     Raises:
-        InputError: a scene or weights cannot be used, or `out` holds something else.
+        InputError: a scene or weights cannot be used, `out` holds something else, or `only` fits
+            nothing.
+        RunError: the reference died.
     """
     rows = read_rows(out, Row)
-    methods = [FLOOR, *METHODS, *(of_weights(path) for path in weights)]
+    methods = [*METHODS, *(of_weights(path) for path in weights)]
+    asked = [FLOOR, *(method for method in methods if only in method.name)]
+    if len(asked) == 1:
+        names = "; ".join(method.name for method in methods)
+        raise InputError(f"--only {only}: no method has this in its name; there are {names}")
     for scene in scenes:
         end = until or scene.duration
         if round(end / scene.frame_interval) < 2:
@@ -237,15 +247,13 @@ def main(
                 f"--until {end:g}: the first frame compiles and is not timed; give at least "
                 f"{2 * scene.frame_interval:g} s, two frames of {scene.name}"
             )
-        reference = out.with_name(f"{out.stem}.{scene.name}.npz")
-        mine = [m for m in methods if only in m.name or m is FLOOR]
+        reference = out.with_name(f"{out.stem}.{scene.name}-{end:g}s.npz")
         there = {row.method for row in rows if (row.scene, row.until) == (scene.name, end)}
-        left = [m for m in mine if m.name not in there]
+        left = [m for m in asked if m.name not in there]
         if left and not reference.exists():
             before = time.perf_counter()
-            trace = run(Job(scene, REFERENCE, end, reference, arch, threads))
-            assert isinstance(trace, Trace)
-            save_trace(reference, trace)
+            job = Job(scene, REFERENCE, end, reference, arch, threads)
+            save_trace(reference, in_own_process(refer, job))
             took = duration(time.perf_counter() - before)
             print(f"{scene.name}: the reference took {took}", file=sys.stderr)
         for method in left:
@@ -291,19 +299,18 @@ def rivals(rows: Sequence[Row], model: str, error: str) -> list[tuple[Row, Row]]
 
 def print_tables(rows: Sequence[Row]) -> None:
     """All rows, and each scene's front, for people."""
-    from rich.table import Table
-
     unit = statistics.median(row.yardstick for row in rows) if rows else 1.0
     for scene in dict.fromkeys(row.scene for row in rows):
         mine = [row for row in rows if row.scene == scene]
-        table = Table(title=f"{scene}, {mine[0].until:g} s: errors against half the spacing [%]")
-        for heading in ("method", "blood", "steps", "wall s / s", *PANELS, "leaks", "died"):
-            table.add_column(heading, justify="left" if heading in ("method", "died") else "right")
+        found = table(
+            f"{scene}, {mine[0].until:g} s: errors against half the spacing [%]",
+            "method", "blood", "steps", "wall s / s", *PANELS, "leaks", "died", left=("died",),
+        )  # fmt: skip
         for row in sorted(mine, key=lambda r: r.at_rest if r.at_rest == r.at_rest else math.inf):
             name = row.method
             if row.step_factor != 1.0:
                 name += f" ({row.step_factor:.3g} x)"
-            table.add_row(
+            found.add_row(
                 name,
                 str(row.blood_particles),
                 str(row.steps),
@@ -312,7 +319,7 @@ def print_tables(rows: Sequence[Row]) -> None:
                 str(row.leaks),
                 f"{row.died} at {100 * row.survived:.0f} %" if row.died else "",
             )
-        console().print(table)
+        console().print(found)
         usable = [row for row in mine if row.method != FLOOR.name]
         for error, label in PANELS.items():
             names = ", ".join(row.method for row in front(usable, error))

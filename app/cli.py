@@ -36,6 +36,28 @@ precision_option = click.option(
     help="Numbers of the simulation.",
 )
 output_path = click.Path(path_type=Path)
+positive = click.FloatRange(min=0, min_open=True)
+until_option = click.option(
+    "--until",
+    type=positive,
+    metavar="SECONDS",
+    help="Simulated time to stop at [s].  [default: the scene's duration]",
+)
+particles_option = click.option(
+    "--particles",
+    type=click.IntRange(min=1),
+    help="Blood particles, instead of the scene's column.",
+)
+height_option = click.option(
+    "--height",
+    type=positive,
+    metavar="METRES",
+    help="Height of the column [m], instead of the scene's.",
+)
+seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+processes_option = click.option(
+    "--processes", type=click.IntRange(min=1), default=1, show_default=True
+)
 
 
 def version() -> str:
@@ -76,12 +98,7 @@ def cli() -> None:
 @cli.command()
 @click.argument("scene_name", metavar="SCENE")
 @click.option("--frames", type=click.IntRange(min=1), help="Number of frames to simulate.")
-@click.option(
-    "--until",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="Simulated time to stop at [s].  [default: the scene's duration]",
-)
+@until_option
 @arch_option
 @threads_option
 @precision_option
@@ -102,17 +119,8 @@ def cli() -> None:
     help="Show the particles of every N-th frame; plots have all frames.",
 )
 @click.option("--summary", type=output_path, metavar="FILE", help="Write the summary as JSON.")
-@click.option(
-    "--particles",
-    type=click.IntRange(min=1),
-    help="Blood particles, instead of the scene's column.",
-)
-@click.option(
-    "--height",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="METRES",
-    help="Height of the column [m], instead of the scene's.",
-)
+@particles_option
+@height_option
 @click.option(
     "--model",
     type=click.Choice(MODELS),
@@ -126,7 +134,7 @@ def cli() -> None:
     metavar="FILE",
     help="Weights of the network.  [default: pcnet.npz beside the scene, or the aorta's]",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 def run(
     scene_name: str,
     frames: int | None,
@@ -251,7 +259,7 @@ def summary_text(summary: "Summary") -> str:
 )
 @arch_option
 @threads_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 def train(
     data: Path,
     out: Path,
@@ -317,11 +325,11 @@ class Heights(click.ParamType):
     help="Steps of the physics in a frame.",
 )
 @click.option("--features", is_flag=True, help="Store the features and targets too.")
-@click.option("--processes", type=click.IntRange(min=1), default=1, show_default=True)
+@processes_option
 @click.option("--scheduler", metavar="dask:ADDRESS", help="Record on a Dask cluster.")
 @arch_option
 @threads_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 def record(
     scene_name: str,
     heights: list[float],
@@ -411,7 +419,7 @@ def validate(
 @click.argument("scene_names", metavar="[SCENE]...", nargs=-1)
 @click.option(
     "--until",
-    type=click.FloatRange(min=0, min_open=True),
+    type=positive,
     metavar="SECONDS",
     default=0.1,
     show_default=True,
@@ -455,7 +463,7 @@ def bench(
 @click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (JSON).")
 @click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=300, show_default=True)
-@click.option("--processes", type=click.IntRange(min=1), default=1, show_default=True)
+@processes_option
 @click.option("--plot", type=output_path, metavar="FILE", help="Draw the ladder (PNG).")
 @arch_option
 def ladder(
@@ -500,21 +508,14 @@ def ladder(
     metavar="RATIO",
     help="Physics with this sound speed over the scene's speed beside; may be given again.",
 )
-@click.option("--particles", type=click.IntRange(min=1), help="Blood particles.")
-@click.option(
-    "--height", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="Column [m]."
-)
-@click.option(
-    "--until",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="Simulated time to stop at [s].  [default: the scene's duration]",
-)
+@particles_option
+@height_option
+@until_option
 @click.option("--json", "json_file", type=output_path, metavar="FILE", help="Write figures.")
 @click.option("--plot", type=output_path, metavar="FILE", help="Draw the curves (PNG).")
 @arch_option
 @threads_option
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@seed_option
 def compare(
     scene_name: str,
     weights: tuple[Path, ...],
@@ -552,21 +553,14 @@ def compare(
 @click.argument("scene_names", metavar="SCENE...", nargs=-1, required=True)
 @click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (CSV).")
 @click.option("--plot", type=output_path, metavar="FILE", help="Draw the chart (PNG).")
-@click.option(
-    "--height", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="Column [m]."
-)
+@height_option
 @click.option(
     "--spacing",
-    type=click.FloatRange(min=0, min_open=True),
+    type=positive,
     metavar="METRES",
     help="Spacing of the plain method [m], instead of the scene's.",
 )
-@click.option(
-    "--until",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="Simulated time [s].  [default: each scene's duration]",
-)
+@until_option
 @click.option(
     "--weights",
     type=output_path,
@@ -630,7 +624,7 @@ def chart(
     metavar="FILE",
     help="Test this network too; may be given again.",
 )
-@click.option("--processes", type=click.IntRange(min=1), default=1, show_default=True)
+@processes_option
 @arch_option
 def stability(
     out: Path,

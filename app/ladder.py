@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from app.output import console, write_json
+from app.output import console, table, write_json
 from nn.dataset import Dataset
 from nn.features import COUNT, NAMES
 from nn.train import Course, Settings, train_weights, use_threads
@@ -248,14 +248,12 @@ def summarise(rows: list[dict[str, Any]]) -> list[Line]:
 
 def print_table(lines: list[Line]) -> None:
     """The ladder for people."""
-    from rich.table import Table
-
-    table = Table(title="rollouts on a run never seen: medians over seeds, up to a death")
-    headings = ("rung", "c m/s", "M", "alive", "survived", "path", "drained", "p99", "training s")
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "rung" else "right")
+    found = table(
+        "rollouts on a run never seen: medians over seeds, up to a death",
+        "rung", "c m/s", "M", "alive", "survived", "path", "drained", "p99", "training s",
+    )  # fmt: skip
     for line in lines:
-        table.add_row(
+        found.add_row(
             line.rung,
             f"{line.sound_speed:.1f}",
             str(line.substeps),
@@ -266,7 +264,7 @@ def print_table(lines: list[Line]) -> None:
             f"{100 * line.compression_p99:.1f} %",
             f"{line.training_seconds:.0f}",
         )
-    console().print(table)
+    console().print(found)
 
 
 def draw(lines: list[Line], path: Path) -> None:

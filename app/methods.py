@@ -11,7 +11,6 @@ import msgspec
 import taichi as ti
 
 from app.models import maker_of
-from nn.pcnet import DirectPcNet
 from nn.weights import Weights
 from taichi_sph.acceleration import AccelerationModel, Fluid
 from taichi_sph.implicit import implicit_for
@@ -83,16 +82,11 @@ class Method:
         elif self.model == "implicit" and self.rounds is not None:
             own = implicit_for(scene, rounds=self.rounds)
         else:
-            own = maker_of(self.model, scene, self.weights)
-
-        def make(fluid: Fluid, capacity: int) -> AccelerationModel:
-            model = own(fluid, capacity)
-            if not self.guarded and isinstance(model, DirectPcNet):
-                model.guarded = False
-            factor = self.step_factor or 1.0
-            return model if factor == 1.0 else Stretched(model, factor)
-
-        return make
+            own = maker_of(self.model, scene, self.weights, self.guarded)
+        factor = self.step_factor or 1.0
+        if factor == 1.0:
+            return own
+        return lambda fluid, capacity: Stretched(own(fluid, capacity), factor)
 
 
 class Stretched:
@@ -154,14 +148,13 @@ REFERENCE = Method("reference", "", spacing=0.5, sound_speed_ratio=20.0)
 FLOOR = Method("spacing 2/3, c = 20 U", "", spacing=2.0 / 3.0, sound_speed_ratio=20.0)
 """How far the next coarser one is from the reference: no error below means anything."""
 
-SPACINGS = (1.0, 1.25, 1.5, 2.0)
+COARSER = (1.25, 1.5, 2.0)
 
 
-def _over_spacing(model: str, **more: Any) -> list[Method]:
-    return [
-        Method(f"{model}, {s:g} d" if s != 1.0 else model, f"{model}, spacing", model, s, **more)
-        for s in SPACINGS
-    ]
+def _over_spacing(plain: Method) -> list[Method]:
+    """A method and its coarser likes."""
+    coarser = [replace(plain, name=f"{plain.name}, {s:g} d", spacing=s) for s in COARSER]
+    return [plain, *coarser]
 
 
 SOFT = Method(
@@ -174,7 +167,7 @@ SOFT = Method(
 """The physics at its fastest, with room left: steps half as long again live too."""
 
 METHODS: tuple[Method, ...] = (
-    *_over_spacing("physics"),
+    *_over_spacing(Method("physics", "physics, spacing")),
     *(
         Method(f"physics, c = {c} U", "physics, sound speed", sound_speed_ratio=c)
         for c in (5.0, 3.0, 2.0)
@@ -190,14 +183,11 @@ METHODS: tuple[Method, ...] = (
         for c, alpha in ((10.0, 0.05), (5.0, 0.3), (3.0, 0.3))
     ),
     Method("physics, Newtonian", "physics, Newtonian", newtonian=True),
-    *(
-        replace(SOFT, name=SOFT.name if s == 1.0 else f"{SOFT.name}, {s:g} d", spacing=s)
-        for s in SPACINGS
-    ),
-    *_over_spacing("implicit"),
+    *_over_spacing(SOFT),
+    *_over_spacing(Method("implicit", "implicit, spacing", "implicit")),
     *(Method(f"implicit, {k} rounds", "implicit, rounds", "implicit", rounds=k) for k in (0, 2, 4)),
     Method("ballistic", "ballistic", "ballistic"),
-    *_over_spacing("pcnet"),
+    *_over_spacing(Method("pcnet", "pcnet, spacing", "pcnet")),
 )
 
 
@@ -210,4 +200,4 @@ def of_weights(path: Path) -> Method:
     training = Weights.load(path).training
     how = f"{training.head} head, {training.correction}"
     name = f"pcnet, {how}, M = {training.substeps}, {training.rounds} rounds, seed {training.seed}"
-    return replace(Method(name, f"pcnet, {how}", "pcnet"), weights=path)
+    return Method(name, f"pcnet, {how}", "pcnet", weights=path)

@@ -10,8 +10,16 @@ if TYPE_CHECKING:
 MODELS = ("physics", "implicit", "pcnet")
 
 
-def maker_of(name: str, scene: "Scene", weights: Path | None = None) -> "ModelMaker":
-    """What makes a model for a scene; `weights` are of pcnet, by default as `weights_for`.
+def maker_of(
+    name: str, scene: "Scene", weights: Path | None = None, guarded: bool = True
+) -> "ModelMaker":
+    """What makes a model for a scene.
+
+    Args:
+        name: one of MODELS.
+        scene: the scene.
+        weights: of pcnet; as `weights_for` by default.
+        guarded: whether the physics stands in for a direct head that runs away.
 
     Raises:
         InputError: weights that cannot be read.
@@ -24,7 +32,7 @@ def maker_of(name: str, scene: "Scene", weights: Path | None = None) -> "ModelMa
         from app.scenes import weights_for
         from nn.pcnet import load_pcnet
 
-        return load_pcnet(weights or weights_for(scene), scene)
+        return load_pcnet(weights or weights_for(scene), scene, guarded)
     from taichi_sph.acceleration import SphAcceleration
 
     return SphAcceleration

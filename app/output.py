@@ -7,12 +7,13 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
+from rich.table import Table
 
 from taichi_sph.errors import InputError
 
@@ -118,6 +119,14 @@ def write_rows(path: Path, rows: Sequence[Any]) -> None:
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
     write_text(path, text.getvalue())
+
+
+def table(title: str, *headings: str, left: Collection[str] = ()) -> Table:
+    """A table whose first column, and those in `left`, are aligned left, the others right."""
+    found = Table(title=title)
+    for k, heading in enumerate(headings):
+        found.add_column(heading, justify="left" if k == 0 or heading in left else "right")
+    return found
 
 
 def console() -> Console:

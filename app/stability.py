@@ -18,8 +18,9 @@ import numpy as np
 
 from app.methods import SOFT, Method, of_weights
 from app.metrics import RULES, Pour, Trace
-from app.output import console, read_rows, write_rows
+from app.output import console, read_rows, table, write_rows
 from app.scenes import find_scene
+from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 
@@ -195,9 +196,8 @@ def one_is_fast(simulation: Simulation, generator: np.random.Generator) -> Start
 def hole(simulation: Simulation, generator: np.random.Generator) -> Start:
     """A sinking column with a hole of two spacings' radius."""
     x, v = sinking(simulation, generator)
-    keep = (
-        np.linalg.norm(x - x.mean(axis=0), axis=1) > 2.0 * simulation.scene.discretization.spacing
-    )
+    d = simulation.scene.discretization.spacing
+    keep = np.linalg.norm(x - x.mean(axis=0), axis=1) > 2.0 * d
     return x[keep], v[keep]
 
 
@@ -393,7 +393,7 @@ def main(
     """Measure what is not yet in `out`, print who died where and why, and draw it.
 
     Raises:
-        InputError: weights cannot be used, or `out` holds something else.
+        InputError: weights cannot be used, `out` holds something else, or `only` fits nothing.
     """
     rows = read_rows(out, Row)
     methods = [*METHODS]
@@ -402,14 +402,22 @@ def main(
         methods.append(method)
         if "direct" in method.name:
             methods.append(replace(method, name=f"{method.name}, no guard", guarded=False))
+    asked = [
+        (method, k)
+        for k, case in enumerate(CASES)
+        for method in methods
+        if only in f"{method.name}, {case.name}" and not (quick and case.until > QUICK)
+    ]
+    if not asked:
+        raise InputError(
+            f'--only {only}: no "METHOD, CASE" has this; methods are '
+            f"{'; '.join(m.name for m in methods)}; cases are {'; '.join(c.name for c in CASES)}"
+        )
     there = {(row.method, row.case) for row in rows}
     jobs = [
         Job(method, k, 1 if quick else starts, arch)
-        for k, case in enumerate(CASES)
-        for method in methods
-        if (method.name, case.name) not in there
-        and only in f"{method.name}, {case.name}"
-        and not (quick and case.until > QUICK)
+        for method, k in asked
+        if (method.name, CASES[k].name) not in there
     ]
     context = multiprocessing.get_context("spawn")
     # Taichi frees no field: a process for each job.
@@ -452,24 +460,20 @@ def cases_of(rows: Sequence[Row]) -> list[str]:
 
 def print_table(rows: Sequence[Row]) -> None:
     """How many live, with the interval, and each death with its reason."""
-    from rich.table import Table
-
-    table = Table(title="who lives")
-    for heading in ("method", "alive", "95 %", "leaks", "worst compression"):
-        table.add_column(heading, justify="left" if heading == "method" else "right")
+    found = table("who lives", "method", "alive", "95 %", "leaks", "worst compression")
     for name in methods_of(rows):
         mine = [row for row in rows if row.method == name]
         alive = sum(not row.died for row in mine)
         low, high = wilson(alive, len(mine))
         living = [row for row in mine if not row.died]
-        table.add_row(
+        found.add_row(
             name,
             f"{alive}/{len(mine)}",
             f"{100 * low:.0f}-{100 * high:.0f} %",
             str(sum(row.leaks for row in living)),
             f"{100 * max((row.compression for row in living), default=math.nan):.1f} %",
         )
-    console().print(table)
+    console().print(found)
     for name in methods_of(rows):
         for case in cases_of(rows):
             mine = cell(rows, name, case)

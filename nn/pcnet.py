@@ -38,6 +38,7 @@ from taichi_sph.implicit import (
     LEAST_RESPONSE,
     STIFFNESS,
     ImplicitAcceleration,
+    step_within_reach,
 )
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
@@ -156,13 +157,20 @@ class DirectPcNet:
 
     name = "pcnet"
 
-    def __init__(self, weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int):
+    def __init__(
+        self,
+        weights: Weights,
+        fluid: Fluid,
+        scales: FeatureScales,
+        capacity: int,
+        guarded: bool = True,
+    ):
         """Make the scratch fields for `capacity` particles."""
         self.network = Network.upload(weights)
         self.fluid = replace(fluid, rheology=VARIABLE, nested=False)
         self.scales = scales
         self.physics = SphAcceleration(fluid, capacity)
-        self.guarded = True
+        self.guarded = guarded
         """Whether the physics may take over."""
         self.fell_back = False
         self.next_acceleration = ti.Vector.field(3, float, capacity)
@@ -189,8 +197,9 @@ class DirectPcNet:
         """The trained step [s], or less: LARGEST_ADVANCE at most, or the physics' own."""
         if self.fell_back:
             return self.physics.stable_step(largest_speed, largest_acceleration)
-        largest = self.scales.speed_limit * LARGEST_ADVANCE
-        return self.scales.frame_interval * min(1.0, largest / max(largest_speed, largest))
+        return step_within_reach(
+            self.scales.frame_interval, self.scales.support_radius, largest_speed
+        )
 
 
 class PressurePcNet(ImplicitAcceleration):
@@ -224,10 +233,13 @@ PcNet = DirectPcNet | PressurePcNet
 """The learned acceleration; stands where `SphAcceleration` stands."""
 
 
-def make_pcnet(weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int) -> PcNet:
-    """The head that the weights are for."""
-    head = DirectPcNet if weights.training.head == "direct" else PressurePcNet
-    return head(weights, fluid, scales, capacity)
+def make_pcnet(
+    weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int, guarded: bool = True
+) -> PcNet:
+    """The head that the weights are for; a direct one with or without its guard."""
+    if weights.training.head == "direct":
+        return DirectPcNet(weights, fluid, scales, capacity, guarded)
+    return PressurePcNet(weights, fluid, scales, capacity)
 
 
 def scales_of(weights: Weights, fluid: Fluid, spacing: float, wall_ratio: float) -> FeatureScales:
@@ -237,7 +249,7 @@ def scales_of(weights: Weights, fluid: Fluid, spacing: float, wall_ratio: float)
     return FeatureScales(radius, spacing, interval, sound, wall_ratio)
 
 
-def load_pcnet(path: Path, scene: Scene) -> Callable[[Fluid, int], PcNet]:
+def load_pcnet(path: Path, scene: Scene, guarded: bool = True) -> Callable[[Fluid, int], PcNet]:
     """A maker of PcNet models for `Simulation`, from a weights file for a scene.
 
     Raises:
@@ -250,7 +262,7 @@ def load_pcnet(path: Path, scene: Scene) -> Callable[[Fluid, int], PcNet]:
         found = {"support_ratio": grid.support_ratio, **proportions(fluid)}
         require_fit(weights, str(path), found)
         scales = scales_of(weights, fluid, grid.spacing, grid.wall_spacing_ratio)
-        return make_pcnet(weights, fluid, scales, capacity)
+        return make_pcnet(weights, fluid, scales, capacity, guarded)
 
     return make
 

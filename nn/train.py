@@ -29,7 +29,7 @@ import torch
 
 from nn.dataset import Dataset, Run, mean_acceleration
 from nn.features import COUNT, NAMES, FeatureScales
-from nn.pcnet import LARGEST_EXPONENT, DirectPcNet, PcNet, largest_factors, make_pcnet
+from nn.pcnet import LARGEST_EXPONENT, PcNet, largest_factors, make_pcnet
 from nn.stage import Stage
 from nn.weights import CLIP, Training, Weights, proportions
 from taichi_sph.acceleration import AccelerationModel
@@ -272,7 +272,6 @@ class Course:
         largest = max((*self.runs, *self.held), key=lambda run: run.facts.particles)
         self.scene = largest.scene
         self.stage = Stage(self.scene, read_vessel(self.scene), largest.facts.seed)
-        self.physics: AccelerationModel = self.stage.model
         low, high = self.stage.vessel.bounds
         self.extent = float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
         """Diagonal of the vessel's box [m]."""
@@ -314,10 +313,8 @@ class Course:
         key = training.head, training.inputs, training.rounds, weights.sizes, arrays
         if key not in self._nets:
             stage = self.stage
-            net = make_pcnet(weights, stage.fluid, self.scales, stage.particles.capacity)
-            if isinstance(net, DirectPcNet):
-                net.guarded = False
-            self._nets[key] = net
+            capacity = stage.particles.capacity
+            self._nets[key] = make_pcnet(weights, stage.fluid, self.scales, capacity, guarded=False)
         self._nets[key].network.load(weights)
         return self._nets[key]
 
@@ -340,7 +337,7 @@ class Course:
         """Mean acceleration [m/s^2] of the physics over the next frame, and where it is valid."""
         stage = self.stage
         before = stage.state()
-        stage.model, stage.step_limit = self.physics, stage.derived.step
+        stage.model, stage.step_limit = stage.physics, stage.derived.step
         stage.advance_to(stage.time + self.interval)
         stage.settle()
         after = stage.state()

@@ -46,6 +46,12 @@ LARGEST_VISCOSITY = 0.03
 """Of rho_0 R^2/T: what an explicit step bears (Morris et al. 1997)."""
 
 
+def step_within_reach(interval: float, support_radius: float, largest_speed: float) -> float:
+    """T [s], or less where blood is so fast that it would go farther than LARGEST_ADVANCE R."""
+    largest = LARGEST_ADVANCE * support_radius / interval
+    return interval * min(1.0, largest / max(largest_speed, largest))
+
+
 class ImplicitAcceleration:
     """The physics' sums under a pressure that looks a step ahead."""
 
@@ -86,9 +92,8 @@ class ImplicitAcceleration:
                 correct_pressure(*sums, self.interval, self.response, own.pressure_term)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
-        """T, or less where blood is so fast that it would go farther than LARGEST_ADVANCE R [s]."""
-        reach = LARGEST_ADVANCE * self.fluid.kernel.support_radius
-        return min(self.interval, reach / max(largest_speed, reach / self.interval))
+        """T, or less, as `step_within_reach` [s]."""
+        return step_within_reach(self.interval, self.fluid.kernel.support_radius, largest_speed)
 
 
 def implicit_for(

@@ -3,6 +3,8 @@ import json
 import pytest
 
 from app import bench
+from app.processes import in_own_process
+from app.scenes import scene_path
 from taichi_sph.errors import InputError
 
 
@@ -14,7 +16,7 @@ def test_a_row_holds_the_quartiles_and_the_cost_of_a_particle():
 
 
 def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for():
-    row = bench._in_own_process(bench.measure_column, 6, 8, "cpu", 1)
+    row = in_own_process(bench.measure_column, 6, 8, "cpu", 1)
     assert row.blood_particles == 6 * 6 * 8
     assert row.proxy_particles == pytest.approx(4 * 6 * 18 + 36, rel=0.02)  # five walls, s = d
     assert row.step_ms > 0.0
@@ -25,6 +27,11 @@ def test_a_peer_that_is_not_installed_is_one_sentence(monkeypatch):
     monkeypatch.setattr(bench, "has_peer", lambda: False)
     with pytest.raises(InputError, match=r"^--peer: pysplishsplash is not installed"):
         bench.main([], peer=True)
+
+
+def test_too_short_a_time_is_one_sentence():
+    with pytest.raises(InputError, match=r"^--until 1e-05: the first 10 steps of PcNet compile"):
+        bench.main([(scene_path("tube"), None)], until=1e-5)
 
 
 def test_figures_go_to_json(tmp_path):

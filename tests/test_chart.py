@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.chart import PANELS, Row, front, load_trace, rivals
+from app.chart import PANELS, Row, front, load_trace, main, rivals
 from app.methods import METHODS, Method
 from app.output import read_rows, write_rows
 from app.scenes import find_scene
@@ -65,6 +65,13 @@ def test_rows_survive_the_file(tmp_path):
     with pytest.raises(InputError, match=f"--out {path}: holds something else"):
         read_rows(path, Row)
     assert read_rows(tmp_path / "none.csv", Row) == []
+
+
+def test_what_fits_nothing_is_one_sentence(tmp_path):
+    out = tmp_path / "chart.csv"
+    with pytest.raises(InputError, match=r"^--only nobody: no method has this in its name"):
+        main([find_scene("box")], 0.02, out, [], "nobody", None, "cpu", 1)
+    assert not list(tmp_path.iterdir())
 
 
 def test_methods_have_names_of_their_own_and_keep_the_volume_of_blood():

@@ -18,6 +18,7 @@ from app.stability import (
     falls,
     few,
     hole,
+    main,
     narrowed,
     one_is_fast,
     one_is_nan,
@@ -27,6 +28,7 @@ from app.stability import (
     wilson,
 )
 from builders import vesselflow
+from taichi_sph.errors import InputError
 from taichi_sph.vessel import read_vessel
 
 D = 1e-3
@@ -125,6 +127,15 @@ def test_a_narrower_throat_is_as_narrow_as_said(tmp_path):
         assert vessel.narrowest == pytest.approx(10e-3 * (1.0 - 0.01 * percent), rel=0.03)
 
 
+def test_what_fits_nothing_is_one_sentence(tmp_path):
+    out = tmp_path / "s.csv"
+    with pytest.raises(
+        InputError, match=r'^--only nobody: no "METHOD, CASE" has this; methods are'
+    ):
+        main(out, 1, False, "nobody", [], 1, None, "cpu")
+    assert not out.exists()
+
+
 def test_names_are_their_own():
     assert len({case.name for case in CASES}) == len(CASES)
     assert len({method.name for method in METHODS}) == len(METHODS)
@@ -151,7 +162,7 @@ def test_the_command_measures_draws_and_does_not_measure_twice(tmp_path):
 def test_a_full_tank_lives(tmp_path):
     """The last defence once looked too little to the side: blood left through the edges."""
     out = tmp_path / "s.csv"
-    vesselflow("stability", "--starts", "1", "--only", "implicit, rest", "--out", out)
+    vesselflow("stability", "--starts", "1", "--only", "2 x step, rest", "--out", out)
     with out.open() as file:
         (row,) = csv.DictReader(file)
     assert row["died"] == ""
