@@ -26,6 +26,8 @@ from taichi_sph.scene import Scene
 
 CELL = 4.0
 """Width of the coarse cells over the scene's spacing."""
+ALIKE = 1e-3
+"""Errors below this tell no method from another."""
 PROBES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Step factors tried for the largest that lives, upwards until one dies; then once in between."""
 PANELS = {
@@ -345,8 +347,8 @@ COLOURS = {
 
 def verdict(rows: Sequence[Row], error: str) -> str:
     """How the network stands where it stands best, against the cheapest that is as good."""
-    if not any(getattr(row, error) for row in rows if not row.died):
-        return "all agree"
+    if max((getattr(row, error) for row in rows if not row.died), default=0.0) < ALIKE:
+        return f"all agree to {100 * ALIKE:g} %"
     pairs = rivals(rows, "pcnet", error)
     best = front(rows, error)
     alone = [row for row in best if row.curve.startswith("pcnet")]

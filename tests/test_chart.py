@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.chart import PANELS, Row, front, load_trace, main, rivals
+from app.chart import PANELS, Row, front, load_trace, main, rivals, verdict
 from app.methods import METHODS, Method
 from app.output import read_rows, write_rows
 from app.scenes import find_scene
@@ -46,6 +46,14 @@ def test_a_rival_is_the_cheapest_that_is_as_good():
     ((mine, rival),) = rivals(ROWS, "pcnet", "drained")
     assert (mine.method, rival.method) == ("pcnet", "physics")
     assert rivals(ROWS[:1] + ROWS[3:], "physics", "drained") == []
+
+
+def test_a_panel_says_how_the_network_stands():
+    assert verdict(ROWS, "drained") == "PcNet on the front: up to 10 x the next as good"
+    assert verdict([*ROWS, row("better", 5.0, 0.03)], "drained") == "PcNet is not on the front"
+    assert verdict([row("pcnet", 1.0, 2e-4), row("physics", 9.0, 0.0)], "drained") == (
+        "all agree to 0.1 %"
+    )
 
 
 def test_cost_is_measured_in_what_the_machine_could_do_meanwhile():
