@@ -19,7 +19,7 @@ run: $(INSTALLED)
 	$(BIN)/vesselflow run $(SCENE) --rrd recordings/$(notdir $(basename $(SCENE))).rrd $(OPTIONS)
 
 test: lint
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 lint: $(DEVELOPS)
 	$(BIN)/ruff check .

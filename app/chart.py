@@ -20,7 +20,7 @@ from app.methods import FLOOR, METHODS, REFERENCE, Method, of_weights
 from app.metrics import RULES, Errors, Grid, Pour, Rules, Trace, errors_of
 from app.output import console, read_rows, table, write_rows
 from app.processes import in_own_process
-from app.progress import duration
+from app.progress import Progress, duration
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene
 
@@ -123,6 +123,19 @@ def _grid_of(scene: Scene, simulation: Any) -> Grid:
     return Grid.over(corners.min(axis=0), corners.max(axis=0), CELL * scene.discretization.spacing)
 
 
+def check_end(scene: Scene, until: float) -> None:
+    """Refuse a time [s] too short to measure.
+
+    Raises:
+        InputError: it is.
+    """
+    if round(until / scene.frame_interval) < 2:
+        raise InputError(
+            f"--until {until:g}: the first frame compiles and is not timed; give at least "
+            f"{2 * scene.frame_interval:g} s, two frames of {scene.name}"
+        )
+
+
 def pour(job: Job, rules: Rules | None) -> tuple[Pour, float]:
     """Pour; needs a process of its own.  With what the yardstick took meanwhile, median [ms]."""
     from taichi_sph.runtime import start
@@ -135,11 +148,14 @@ def pour(job: Job, rules: Rules | None) -> tuple[Pour, float]:
     grid = _grid_of(job.scene, simulation)
     poured = Pour(job.method.name, simulation, Trace(interval), grid, rules)
     tick, ticks = _yardstick(), []
+    progress = Progress(job.until, f"{job.scene.name}, {job.method.name}")
     for frame in range(1, job.frames + 1):
         poured.frame(frame * interval)
         ticks.append(tick())
+        progress.show(frame * interval, simulation.steps, 0)
         if poured.death or poured.empty:
             break
+    progress.close()
     return poured, statistics.median(ticks)
 
 
@@ -219,39 +235,41 @@ def measured(job: Job) -> Row:
     return best if between.died else between
 
 
+def asked(weights: Sequence[Path], only: str) -> list[Method]:
+    """Methods, and networks of these files, that have `only` in their name.
+
+    Raises:
+        InputError: weights cannot be read, or `only` fits nothing.
+    """
+    methods = [*METHODS, *(of_weights(path) for path in weights)]
+    found = [method for method in methods if only in method.name]
+    if not found:
+        names = "; ".join(method.name for method in methods)
+        raise InputError(f"--only {only}: no method has this in its name; there are {names}")
+    return found
+
+
 def main(
     scenes: Sequence[Scene],
     until: float | None,
     out: Path,
-    weights: Sequence[Path],
-    only: str,
-    plot: Path | None,
+    methods: Sequence[Method],
     arch: str,
     threads: int | None,
-) -> None:
-    """Measure what is not yet in `out`, print what it says, and draw it.
+) -> list[Row]:
+    """Measure what is not yet in `out`; all rows that it then has.
 
     Raises:
-        InputError: a scene or weights cannot be used, `out` holds something else, or `only` fits
-            nothing.
+        InputError: a scene cannot be used, or `out` holds something else.
         RunError: the reference died.
     """
     rows = read_rows(out, Row)
-    methods = [*METHODS, *(of_weights(path) for path in weights)]
-    asked = [FLOOR, *(method for method in methods if only in method.name)]
-    if len(asked) == 1:
-        names = "; ".join(method.name for method in methods)
-        raise InputError(f"--only {only}: no method has this in its name; there are {names}")
     for scene in scenes:
         end = until or scene.duration
-        if round(end / scene.frame_interval) < 2:
-            raise InputError(
-                f"--until {end:g}: the first frame compiles and is not timed; give at least "
-                f"{2 * scene.frame_interval:g} s, two frames of {scene.name}"
-            )
+        check_end(scene, end)
         reference = out.with_name(f"{out.stem}.{scene.name}-{end:g}s.npz")
         there = {row.method for row in rows if (row.scene, row.until) == (scene.name, end)}
-        left = [m for m in asked if m.name not in there]
+        left = [m for m in (FLOOR, *methods) if m.name not in there]
         if left and not reference.exists():
             before = time.perf_counter()
             job = Job(scene, REFERENCE, end, reference, arch, threads)
@@ -272,9 +290,7 @@ def main(
                 f"{state} ({len(rows)} rows)",
                 file=sys.stderr,
             )
-    print_tables(rows)
-    if plot is not None:
-        draw(rows, plot)
+    return rows
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
@@ -339,6 +355,7 @@ COLOURS = {
     "physics, Newtonian": "tab:purple",
     "soft physics, spacing": "magenta",
     "implicit, spacing": "tab:green",
+    "implicit, 0 rounds": "limegreen",
     "implicit, rounds": "olive",
     "ballistic": "black",
     "pcnet, spacing": "tab:red",

@@ -54,6 +54,19 @@ height_option = click.option(
     metavar="METRES",
     help="Height of the column [m], instead of the scene's.",
 )
+spacing_option = click.option(
+    "--spacing",
+    type=positive,
+    metavar="METRES",
+    help="Distance between blood particles [m], instead of the scene's.",
+)
+error_option = click.option(
+    "--error",
+    type=click.FloatRange(min=0, max=1, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="Largest error that is borne, against a pour at half the spacing.",
+)
 seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 processes_option = click.option(
     "--processes", type=click.IntRange(min=1), default=1, show_default=True
@@ -123,11 +136,13 @@ def cli() -> None:
 @height_option
 @click.option(
     "--model",
-    type=click.Choice(MODELS),
+    type=click.Choice([*MODELS, "auto"]),
     default="physics",
     show_default=True,
-    help="What computes accelerations; implicit takes long steps, so does pcnet, a network.",
+    help="What computes accelerations; implicit takes long steps, so does pcnet, a network; "
+    "auto asks `advise`, which pours the scene first, and takes its spacing too.",
 )
+@error_option
 @click.option(
     "--weights",
     type=output_path,
@@ -149,6 +164,7 @@ def run(
     particles: int | None,
     height: float | None,
     model: str,
+    error: float,
     weights: Path | None,
     seed: int,
 ) -> int:
@@ -168,6 +184,9 @@ def run(
         raise InputError("--every: nothing is shown without --rrd or --live")
     if weights is not None and model != "pcnet":
         raise InputError("--weights: only --model pcnet has weights")
+    asked = click.get_current_context().get_parameter_source("error")
+    if asked is not click.core.ParameterSource.DEFAULT and model != "auto":
+        raise InputError("--error: only --model auto has a budget")
 
     from app.drive import drive
     from app.models import maker_of
@@ -175,8 +194,17 @@ def run(
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
 
+    if model == "auto":
+        from app.advise import DEFAULT, advise
+
+        advice = advise(scene, error, DEFAULT, None, end, arch, threads)
+        click.echo(advice.text, err=True)
+        scene = advice.method.scene(scene)
+        maker = advice.method.maker(scene)
+    else:
+        maker = maker_of(model, scene, weights)
     start(arch, precision, threads, random_seed=seed)
-    simulation = Simulation.from_scene(scene, maker_of(model, scene, weights), seed)
+    simulation = Simulation.from_scene(scene, maker, seed)
     view = None
     if rrd is not None or live is not None:
         from app.view import RerunView
@@ -463,6 +491,9 @@ def bench(
 @click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (JSON).")
 @click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=300, show_default=True)
+@click.option(
+    "--ablate", is_flag=True, help="Leave out groups of features in turn, instead of the rungs."
+)
 @processes_option
 @click.option("--plot", type=output_path, metavar="FILE", help="Draw the ladder (PNG).")
 @arch_option
@@ -471,6 +502,7 @@ def ladder(
     out: Path,
     seeds: int,
     iterations: int,
+    ablate: bool,
     processes: int,
     plot: Path | None,
     arch: str,
@@ -487,7 +519,7 @@ def ladder(
     learn.check_plot(plot)
     from app import ladder as study
 
-    study.main(list(data), out, seeds, iterations, processes, plot, arch)
+    study.main(list(data), out, seeds, iterations, ablate, processes, plot, arch)
     return 0
 
 
@@ -554,12 +586,7 @@ def compare(
 @click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (CSV).")
 @click.option("--plot", type=output_path, metavar="FILE", help="Draw the chart (PNG).")
 @height_option
-@click.option(
-    "--spacing",
-    type=positive,
-    metavar="METRES",
-    help="Spacing of the plain method [m], instead of the scene's.",
-)
+@spacing_option
 @until_option
 @click.option(
     "--weights",
@@ -587,27 +614,19 @@ def chart(
 
     What is in FILE already is not measured again: scenes can be added one by one.
     """
-    import msgspec
-
     from app import chart as charting
     from app.learn import check_plot
     from app.output import check_output
-    from app.scenes import find_scene, with_column
+    from app.scenes import find_scene, varied
 
     check_output(out, "--out", b"scene,")
     check_plot(plot)
-    scenes = []
-    for name in scene_names:
-        scene = with_column(find_scene(name), None, height)
-        grid, label = scene.discretization, scene.name
-        if spacing is not None:
-            grid = msgspec.structs.replace(grid, spacing=spacing)
-            label += f"-d{1e3 * spacing:g}mm"
-        if height is not None:
-            label += f"-{1e3 * height:g}mm"
-        scene = msgspec.structs.replace(scene, name=label, discretization=grid)
-        scenes.append(scene)
-    charting.main(scenes, until, out, weights, only, plot, arch, threads)
+    scenes = [varied(find_scene(name), height, spacing) for name in scene_names]
+    methods = charting.asked(weights, only)
+    rows = charting.main(scenes, until, out, methods, arch, threads)
+    charting.print_tables(rows)
+    if plot is not None:
+        charting.draw(rows, plot)
     return 0
 
 
@@ -615,7 +634,11 @@ def chart(
 @click.option("--out", type=output_path, required=True, metavar="FILE", help="Figures (CSV).")
 @click.option("--plot", type=output_path, metavar="FILE", help="Draw the matrix (PNG).")
 @click.option("--starts", type=click.IntRange(min=1), default=3, show_default=True)
-@click.option("--quick", is_flag=True, help="One start, and no case longer than 0.2 s.")
+@click.option(
+    "--quick",
+    is_flag=True,
+    help="One start, no case longer than 0.2 s, and only the models of `run`.",
+)
 @click.option("--only", default="", metavar="TEXT", help='Only what has this in "METHOD, CASE".')
 @click.option(
     "--weights",
@@ -647,6 +670,69 @@ def stability(
     check_output(out, "--out", b"method,")
     check_plot(plot)
     study.main(out, starts, quick, only, weights, processes, plot, arch)
+    return 0
+
+
+@cli.command()
+@click.argument("scene_name", metavar="SCENE")
+@error_option
+@click.option(
+    "--of",
+    "measures",
+    type=click.Choice(["drained", "energy", "field"]),
+    multiple=True,
+    default=("drained", "energy"),
+    show_default=True,
+    help="What the error is of: the drained part, the kinetic energy, the momentum on a coarse "
+    "grid; may be given again.",
+)
+@click.option(
+    "--realtime",
+    type=positive,
+    metavar="FACTOR",
+    help="Simulated seconds that a second of wall time must give.",
+)
+@height_option
+@spacing_option
+@until_option
+@click.option(
+    "--check",
+    type=output_path,
+    metavar="FILE",
+    help="Measure all that is listed against a pour at half the spacing, as `chart` does (CSV).",
+)
+@arch_option
+@threads_option
+def advise(
+    scene_name: str,
+    error: float,
+    measures: tuple[str, ...],
+    realtime: float | None,
+    height: float | None,
+    spacing: float | None,
+    until: float | None,
+    check: Path | None,
+    arch: str,
+    threads: int | None,
+) -> int:
+    """Name the cheapest method and spacing within an error, and say why.
+
+    The scene is poured by the implicit model at several spacings; the rest is from the chart and
+    the stability cases that come with the program.
+    """
+    from app import advise as study
+    from app.output import check_output, console
+    from app.scenes import find_scene, varied
+
+    scene = varied(find_scene(scene_name), height, spacing)
+    end = until or scene.duration
+    if check is not None:
+        check_output(check, "--check", b"scene,")
+    advice = study.advise(scene, error, measures, realtime, end, arch, threads)
+    console().print(study.candidates_table(scene, advice))
+    click.echo(advice.text)
+    if check is not None:
+        click.echo(study.checked(scene, advice, error, measures, end, check, arch, threads))
     return 0
 
 

@@ -90,7 +90,8 @@ def contestants(
 
     runs = [stand(name, scene, maker_of(name, scene)) for name in ("physics", "implicit")]
     for path in weights:
-        name = "pcnet" if len(weights) == 1 else f"pcnet, {path.stem}"
+        file = path.with_suffix("").as_posix()
+        name = "pcnet" if len(weights) == 1 else f"pcnet, {'/'.join(file.split('/')[-2:])}"
         runs.append(stand(name, scene, maker_of("pcnet", scene, path)))
     for ratio in soft:
         grid = msgspec.structs.replace(scene.discretization, sound_speed_ratio=ratio)

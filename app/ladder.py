@@ -81,13 +81,40 @@ RUNGS = (
     Rung("pressure, relabel, 2 rounds", Settings(rounds=2)),
 )
 
+GROUPS = {
+    "acceleration": ("a_x", "a_y", "a_z"),
+    "N": ("N",),
+    "mean position": ("disx_b", "disy_b", "disz_b"),
+    "mean velocity": ("rvx_b", "rvy_b", "rvz_b"),
+    "spread of distances": ("D_dis_b",),
+    "spread of speeds": ("D_rv_b",),
+    "higher moments": ("alpha_dis_b", "alpha_rv_b", "beta_dis_b", "beta_rv_b"),
+    "M": ("M",),
+    "proxies' mean position": ("disx_p", "disy_p", "disz_p"),
+    "proxies' moments": ("D_dis_p", "alpha_dis_p", "beta_dis_p"),
+    "compression": ("compression",),
+    "divergence": ("divergence",),
+}
+"""Features that are left out together."""
+ABLATIONS = (
+    Rung("pressure, all 25 inputs", Settings(inputs=NAMES)),
+    *(
+        Rung(f"all but {name}", Settings(inputs=tuple(n for n in NAMES if n not in group)))
+        for name, group in GROUPS.items()
+    ),
+    Rung("pressure, relabel", Settings()),
+    Rung("pressure, no input", Settings(inputs=())),
+)
+"""Rungs of `--ablate`."""
+ORDER = list(dict.fromkeys(rung.name for rung in (*RUNGS, *ABLATIONS)))
+
 
 @dataclass(frozen=True)
 class Task:
     """One rung on one dataset with one seed."""
 
     data: Path
-    rung: int
+    rung: Rung
     seed: int
     iterations: int
     arch: str
@@ -99,7 +126,7 @@ def measure(task: Task) -> dict[str, Any]:
 
     use_threads(1)
     start(task.arch, "f32", 1, random_seed=task.seed)
-    rung = RUNGS[task.rung]
+    rung = task.rung
     settings = replace(rung.settings, seed=task.seed, iterations=task.iterations)
     with Dataset(task.data) as file:
         last = len(file.runs) - 1
@@ -157,6 +184,7 @@ def main(
     out: Path,
     seeds: int,
     iterations: int,
+    ablate: bool,
     processes: int,
     plot: Path | None,
     arch: str,
@@ -172,9 +200,9 @@ def main(
     done = _read(out, iterations)
     there = {(row["data"], row["rung"], row["seed"]) for row in done}
     tasks = [
-        Task(path, k, seed, iterations, arch)
+        Task(path, rung, seed, iterations, arch)
         for path in data
-        for k, rung in enumerate(RUNGS)
+        for rung in (ABLATIONS if ablate else RUNGS)
         # What is fitted without chance needs no second seed.
         for seed in range(1 if rung.fit else seeds)
         if (path.name, rung.name, seed) not in there
@@ -216,14 +244,13 @@ class Line:
 def summarise(rows: list[dict[str, Any]]) -> list[Line]:
     """A line for each rung and dataset, in the order of RUNGS."""
     lines = []
-    order = [rung.name for rung in RUNGS]
-    keys = {(row["sound_speed"], row["substeps"], order.index(row["rung"])) for row in rows}
+    keys = {(row["sound_speed"], row["substeps"], ORDER.index(row["rung"])) for row in rows}
     for sound_speed, substeps, k in sorted(keys):
         mine = [
             row
             for row in rows
             if (row["rung"], row["substeps"], row["sound_speed"])
-            == (order[k], substeps, sound_speed)
+            == (ORDER[k], substeps, sound_speed)
         ]
 
         def median(name: str, mine: list[dict[str, Any]] = mine) -> float:
@@ -231,7 +258,7 @@ def summarise(rows: list[dict[str, Any]]) -> list[Line]:
 
         lines.append(
             Line(
-                order[k],
+                ORDER[k],
                 substeps,
                 sound_speed,
                 sum(row["survived"] == 1.0 for row in mine),
@@ -271,13 +298,13 @@ def draw(lines: list[Line], path: Path) -> None:
     """Draw which rungs live, and how wrong those are that live, over M."""
     from matplotlib.figure import Figure
 
-    names = [rung.name for rung in RUNGS]
+    names = [name for name in ORDER if any(line.rung == name for line in lines)]
     speeds = sorted({line.sound_speed for line in lines})
     columns = [
         (c, m) for c in speeds for m in sorted({x.substeps for x in lines if x.sound_speed == c})
     ]
     grid = np.full((len(names), len(columns)), np.nan)
-    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(9.0, 1.2 + 0.31 * len(names)), layout="constrained")
     axes = figure.add_subplot()
     for line in lines:
         row, column = names.index(line.rung), columns.index((line.sound_speed, line.substeps))

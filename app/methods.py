@@ -185,7 +185,8 @@ METHODS: tuple[Method, ...] = (
     Method("physics, Newtonian", "physics, Newtonian", newtonian=True),
     *_over_spacing(SOFT),
     *_over_spacing(Method("implicit", "implicit, spacing", "implicit")),
-    *(Method(f"implicit, {k} rounds", "implicit, rounds", "implicit", rounds=k) for k in (0, 2, 4)),
+    *_over_spacing(Method("implicit, 0 rounds", "implicit, 0 rounds", "implicit", rounds=0)),
+    *(Method(f"implicit, {k} rounds", "implicit, rounds", "implicit", rounds=k) for k in (2, 4)),
     Method("ballistic", "ballistic", "ballistic"),
     *_over_spacing(Method("pcnet", "pcnet, spacing", "pcnet")),
 )

@@ -84,6 +84,8 @@ def broken_rule(
     return ""
 
 
+RESTING = 0.01
+"""Speed over the scene's below which blood is at rest."""
 SETTLING = 0.1
 """Speed over the scene's that blood may gain where a start is not in balance."""
 
@@ -148,6 +150,8 @@ class Trace:
     """99th percentile."""
     leaked: list[float] = field(default_factory=list)
     """Part outside the lumen."""
+    slow: list[float] = field(default_factory=list)
+    """Part at rest, of what is there: slower than RESTING of the scene's speed."""
 
     def note(
         self, simulation: Simulation, figures: Diagnostics, blood: int, grid: Grid | None
@@ -159,6 +163,8 @@ class Trace:
         self.energy.append(figures.kinetic_energy / (blood * simulation.particles.mass))
         self.compression.append(figures.compression_p99)
         self.leaked.append(figures.leaks / blood)
+        resting = RESTING * (simulation.derived.expected_speed or 1.0)
+        self.slow.append(float(np.mean(np.linalg.norm(v, axis=1) < resting)) if len(v) else 0.0)
         if grid is not None:
             self.momentum.append(grid.share_out(x, v / blood).astype(np.float32))
 

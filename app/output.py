@@ -109,7 +109,7 @@ def read_rows(path: Path, row: type[RowType]) -> list[RowType]:
                 for line in csv.DictReader(file)
             ]
     except (KeyError, TypeError, ValueError, csv.Error):
-        raise InputError(f"--out {path}: holds something else, or is cut; name another") from None
+        raise InputError(f"{path}: holds something else, or is cut; name another") from None
 
 
 def write_rows(path: Path, rows: Sequence[Any]) -> None:

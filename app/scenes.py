@@ -87,6 +87,18 @@ def with_column(scene: Scene, particles: int | None, height: float | None) -> Sc
     return msgspec.structs.replace(scene, column=column)
 
 
+def varied(scene: Scene, height: float | None, spacing: float | None) -> Scene:
+    """The scene with another column [m] or spacing [m], where one is asked for, named by it."""
+    name = scene.name
+    if spacing is not None:
+        grid = msgspec.structs.replace(scene.discretization, spacing=spacing)
+        scene = msgspec.structs.replace(scene, discretization=grid)
+        name += f"-d{1e3 * spacing:g}mm"
+    if height is not None:
+        name += f"-{1e3 * height:g}mm"
+    return msgspec.structs.replace(with_column(scene, None, height), name=name)
+
+
 def weights_for(scene: Scene) -> Path:
     """Weights to pour a scene with: those beside it, or the aorta's, which serve any vessel."""
     own = Path(scene.folder) / WEIGHTS

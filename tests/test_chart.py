@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.chart import PANELS, Row, front, load_trace, main, rivals, verdict
+from app.chart import PANELS, Row, asked, front, load_trace, rivals, verdict
 from app.methods import METHODS, Method
 from app.output import read_rows, write_rows
 from app.scenes import find_scene
@@ -70,16 +70,15 @@ def test_rows_survive_the_file(tmp_path):
         replace(r, half_drained=0.0) for r in ROWS
     ]
     path.write_text("scene,until\nA,0.1\n")
-    with pytest.raises(InputError, match=f"--out {path}: holds something else"):
+    with pytest.raises(InputError, match=f"^{path}: holds something else"):
         read_rows(path, Row)
     assert read_rows(tmp_path / "none.csv", Row) == []
 
 
-def test_what_fits_nothing_is_one_sentence(tmp_path):
-    out = tmp_path / "chart.csv"
+def test_what_fits_nothing_is_one_sentence():
     with pytest.raises(InputError, match=r"^--only nobody: no method has this in its name"):
-        main([find_scene("box")], 0.02, out, [], "nobody", None, "cpu", 1)
-    assert not list(tmp_path.iterdir())
+        asked([], "nobody")
+    assert {m.name for m in asked([], "2 rounds")} == {"implicit, 2 rounds"}
 
 
 def test_methods_have_names_of_their_own_and_keep_the_volume_of_blood():
@@ -97,8 +96,8 @@ def test_methods_have_names_of_their_own_and_keep_the_volume_of_blood():
 
 def test_the_command_measures_draws_and_does_not_measure_twice(box: Path, tmp_path: Path):
     out, picture = tmp_path / "chart.csv", tmp_path / "chart.png"
-    asked = ("chart", box, "--until", "0.02", "--only", "2 rounds", "--out", out)
-    told = vesselflow(*asked, "--plot", picture)
+    command = ("chart", box, "--until", "0.02", "--only", "2 rounds", "--out", out)
+    told = vesselflow(*command, "--plot", picture)
     assert "implicit, 2 rounds" in told
     assert picture.read_bytes().startswith(b"\x89PNG")
     with out.open() as file:
@@ -111,5 +110,5 @@ def test_the_command_measures_draws_and_does_not_measure_twice(box: Path, tmp_pa
     (reference,) = tmp_path.glob("chart.*.npz")
     assert len(load_trace(reference).drained) == 4
     before = out.read_bytes()
-    vesselflow(*asked)
+    vesselflow(*command)
     assert out.read_bytes() == before

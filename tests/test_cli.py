@@ -253,6 +253,7 @@ BAD = {
     "frames and until": (options("--frames", "2", "--until", "1"), "one of the two"),
     "no frames": (options("--frames", "0"), "--frames"),
     "every of nothing": (options("--every", "2"), "--every"),
+    "budget of nothing": (options("--error", "0.2"), "--error"),
     "unknown option": (options("--gpu"), "--gpu"),
     "port out of range": (options("--live", "70000"), "--live"),
     "recording into no folder": (options("--rrd", "/no/such/run.rrd"), "does not exist"),

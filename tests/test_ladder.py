@@ -9,7 +9,8 @@ import pytest
 
 pytest.importorskip("torch", reason="torch is an extra: pip install 'vesselflow[train]'")
 
-from app.ladder import RUNGS, main, summarise
+from app.ladder import GROUPS, RUNGS, main, summarise
+from nn.features import NAMES
 from taichi_sph.errors import InputError
 
 
@@ -45,8 +46,8 @@ def test_one_rung_is_measured_and_what_is_measured_is_not_repeated(box: Path, tm
     data, out, picture = box / "data.h5", tmp_path / "ladder.json", tmp_path / "ladder.png"
     code = (
         "from pathlib import Path; import json; from app.ladder import Task, measure, RUNGS;"
-        "k = [rung.name for rung in RUNGS].index('pressure, no input');"
-        f"print(json.dumps(measure(Task(Path({str(data)!r}), k, 0, 6, 'cpu'))))"
+        "rung = next(rung for rung in RUNGS if rung.name == 'pressure, no input');"
+        f"print(json.dumps(measure(Task(Path({str(data)!r}), rung, 0, 6, 'cpu'))))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True
@@ -61,13 +62,17 @@ def test_one_rung_is_measured_and_what_is_measured_is_not_repeated(box: Path, tm
     ]
     out.write_text(json.dumps({"iterations": 6, "rows": rows}))
     before = out.read_bytes()
-    main([data], out, 2, 6, 1, picture, "cpu")  # nothing is left to measure
+    main([data], out, 2, 6, False, 1, picture, "cpu")  # nothing is left to measure
     assert out.read_bytes() == before
     assert picture.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(InputError, match="holds trainings of 6 iterations, asked for are 7"):
-        main([data], out, 2, 7, 1, None, "cpu")
+        main([data], out, 2, 7, False, 1, None, "cpu")
     for text in ("{", '{"rows": []}'):
         out.write_text(text)
         with pytest.raises(InputError, match="not the figures of a ladder"):
-            main([data], out, 2, 6, 1, None, "cpu")
+            main([data], out, 2, 6, False, 1, None, "cpu")
         assert out.read_text() == text
+
+
+def test_every_feature_is_left_out_once():
+    assert sorted(name for group in GROUPS.values() for name in group) == sorted(NAMES)
