@@ -88,8 +88,8 @@ def shipped(
     return make
 
 
-def narrowed(percent: float) -> Callable[[Path], Scene]:
-    """The stenosis with another narrowing of its radius."""
+def narrowed(percent: float, spacing: float, height: float) -> Callable[[Path], Scene]:
+    """The stenosis with another narrowing of its radius, spacing [m] and column [m]."""
 
     def make(folder: Path) -> Scene:
         from taichi_sph.centreline import remake
@@ -101,7 +101,10 @@ def narrowed(percent: float) -> Callable[[Path], Scene]:
         (folder / "centreline.json").write_bytes(msgspec.json.encode(table))
         (folder / "scene.toml").write_text((source / "scene.toml").read_text())
         remake(folder)
-        return read_scene(folder / "scene.toml")
+        scene = read_scene(folder / "scene.toml")
+        grid = msgspec.structs.replace(scene.discretization, spacing=spacing)
+        column = msgspec.structs.replace(scene.column, height=height)
+        return msgspec.structs.replace(scene, discretization=grid, column=column)
 
     return make
 
@@ -265,8 +268,8 @@ CASES: tuple[Case, ...] = (
     Case("high column", shipped("aortoiliac", 1.2e-3, 0.022), 0.15),
     Case("portal vein", shipped("portal_vein", 8e-4, 0.006), 0.3),
     Case("carotid siphon", shipped("carotid_siphon", 4.4e-4, 0.006), 0.15),
-    Case("narrowed by 50 %", narrowed(50.0), 0.15),
-    Case("narrowed by 75 %", narrowed(75.0), 0.15),
+    Case("narrowed by 50 %", narrowed(50.0, 8e-4, 0.008), 0.15),
+    Case("narrowed by 75 %", narrowed(75.0, 6e-4, 0.005), 0.15),
     Case("jet, 1 x speed", WEIGHTLESS, 0.03, ball(0.9)),
     Case("jet, 2 x speed", WEIGHTLESS, 0.03, ball(1.8)),
     Case("jet, 4 x speed", WEIGHTLESS, 0.03, ball(3.6)),

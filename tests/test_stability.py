@@ -122,7 +122,7 @@ def test_a_narrower_throat_is_as_narrow_as_said(tmp_path):
     for percent in (50.0, 75.0):
         folder = tmp_path / f"{percent:g}"
         folder.mkdir()
-        vessel = read_vessel(narrowed(percent)(folder))
+        vessel = read_vessel(narrowed(percent, 6e-4, 0.005)(folder))
         # Of a bore of 10 mm, by the diameter of the largest ball that passes.
         assert vessel.narrowest == pytest.approx(10e-3 * (1.0 - 0.01 * percent), rel=0.03)
 
