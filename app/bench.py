@@ -4,9 +4,6 @@ Every row is measured in a process of its own, since Taichi frees no field.  Tim
 frames or blocks of steps, neighbour search included; nothing is logged or drawn meanwhile.
 """
 
-import ctypes
-import importlib.util
-import json
 import math
 import os
 import platform
@@ -23,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.output import console, table, write_json
+from app.peers import begin, require_peer
 from app.processes import in_own_process
 from app.scenes import weights_for, with_column
-from taichi_sph.errors import InputError, RunError
+from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, parse_scene, read_scene
 
 if TYPE_CHECKING:
@@ -261,20 +259,8 @@ def _blocks(step: Callable[[], Any], count: int) -> float:
     return (time.perf_counter() - before) / (count * BLOCK)
 
 
-def has_peer() -> bool:
-    """Whether pysplishsplash is installed."""
-    return importlib.util.find_spec("pysplishsplash") is not None
-
-
 def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, sound: float) -> Any:
     """SPlisHSPlasH's WCSPH with a like column in a like tank; returns (step, blood, proxies)."""
-    for library in ("X11.so.6", "GLdispatch.so.0", "GLX.so.0", "OpenGL.so.0", "GL.so.1"):
-        # Its wheel brings a GL that crashes at import unless the system's is there first.
-        try:
-            ctypes.CDLL(f"lib{library}", mode=ctypes.RTLD_GLOBAL)
-        except OSError as error:
-            raise RunError(f"bench --peer: pysplishsplash needs lib{library} ({error})") from None
-    import pysplishsplash as sph
     import trimesh
 
     d = 1e-3
@@ -292,8 +278,7 @@ def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, so
             "gravitation": [0, 0, -9.81],
             "cflMethod": 0,
             "timeStepSize": dt,
-            "stiffness": 1060.0 * sound**2 / 7.0,
-            "exponent": 7,
+            "WCSPH": {"stiffness": 1060.0 * sound**2 / 7.0, "exponent": 7},
             "boundaryHandlingMethod": 0,
             "enableZSort": True,
         },
@@ -323,12 +308,9 @@ def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, so
             }
         ],
     }
-    (folder / "peer.json").write_text(json.dumps(scene))
-    base = sph.Exec.SimulatorBase()
-    base.init(useGui=False, sceneFile=str(folder / "peer.json"), outputDir=str(folder / "out"))
-    base.setValueFloat(base.STOP_AT, 1e-9)
-    base.initSimulation()
-    base.runSimulation()  # loads the wall
+    base = begin(scene, folder)
+    import pysplishsplash as sph
+
     simulation = sph.Simulation.getCurrent()
     fluid = simulation.getFluidModel(0)
     viscosity = fluid.getViscosityBase()
@@ -460,8 +442,8 @@ def main(
     Raises:
         InputError: the peer is asked for and not installed, or the time is too short.
     """
-    if peer and not has_peer():
-        raise InputError("--peer: pysplishsplash is not installed; pip install 'vesselflow[peer]'")
+    if peer:
+        require_peer()
     terminal = console()
     machine = _machine(arch, threads)
     terminal.print(", ".join(f"{key} {value}" for key, value in machine.items()))

@@ -6,6 +6,7 @@ that a machine that is busy now and then does not favour anyone.
 """
 
 import math
+import os
 import statistics
 import sys
 import time
@@ -16,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from app.methods import FLOOR, METHODS, REFERENCE, Method, of_weights
+from app.methods import FLOOR, METHODS, PEERS, REFERENCE, Method, of_weights
 from app.metrics import RULES, Errors, Grid, Pour, Rules, Trace, errors_of
 from app.output import console, read_rows, table, write_rows
+from app.peers import require_peer
 from app.processes import in_own_process
 from app.progress import Progress, duration
 from taichi_sph.errors import InputError, RunError
@@ -139,12 +141,12 @@ def check_end(scene: Scene, until: float) -> None:
 def pour(job: Job, rules: Rules | None) -> tuple[Pour, float]:
     """Pour; needs a process of its own.  With what the yardstick took meanwhile, median [ms]."""
     from taichi_sph.runtime import start
-    from taichi_sph.simulation import Simulation
 
     start(job.arch, "f32", job.threads)
+    if job.threads:
+        os.environ["OMP_NUM_THREADS"] = str(job.threads)  # of a peer, which is not loaded yet
     interval = job.scene.frame_interval
-    scene = job.method.scene(job.scene)
-    simulation = Simulation.from_scene(scene, job.method.maker(scene))
+    simulation = job.method.simulation(job.scene)
     grid = _grid_of(job.scene, simulation)
     poured = Pour(job.method.name, simulation, Trace(interval), grid, rules)
     tick, ticks = _yardstick(), []
@@ -235,13 +237,15 @@ def measured(job: Job) -> Row:
     return best if between.died else between
 
 
-def asked(weights: Sequence[Path], only: str) -> list[Method]:
-    """Methods, and networks of these files, that have `only` in their name.
+def asked(weights: Sequence[Path], only: str, peer: bool) -> list[Method]:
+    """Methods, other programs and networks of these files, that have `only` in their name.
 
     Raises:
-        InputError: weights cannot be read, or `only` fits nothing.
+        InputError: weights cannot be read, `only` fits nothing, or a peer is not installed.
     """
-    methods = [*METHODS, *(of_weights(path) for path in weights)]
+    if peer:
+        require_peer()
+    methods = [*METHODS, *(PEERS if peer else ()), *(of_weights(path) for path in weights)]
     found = [method for method in methods if only in method.name]
     if not found:
         names = "; ".join(method.name for method in methods)
@@ -359,6 +363,10 @@ COLOURS = {
     "implicit, rounds": "olive",
     "ballistic": "black",
     "pcnet, spacing": "tab:red",
+    "splishsplash-wcsph, spacing": "gold",
+    "splishsplash-wcsph, longest step": "darkgoldenrod",
+    "splishsplash-dfsph, spacing": "tab:orange",
+    "splishsplash-dfsph, longest step": "tab:brown",
 }
 
 
@@ -387,7 +395,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     figure = Figure(figsize=(4.4 * len(PANELS), 4.2 * len(scenes) + 1.0), layout="constrained")
     grid = figure.subplots(len(scenes), len(PANELS), squeeze=False)
     curves = list(dict.fromkeys(row.curve for row in rows if row.curve))
-    spare = iter(("tab:orange", "tab:pink", "tab:brown", "tab:gray", "gold", "lime"))
+    spare = iter(("tab:pink", "tab:gray", "lime"))
     colours = {curve: COLOURS.get(curve) or next(spare, "tab:gray") for curve in curves}
     for line, scene in zip(grid, scenes, strict=True):
         mine = [row for row in rows if row.scene == scene]

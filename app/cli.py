@@ -596,6 +596,7 @@ def compare(
     help="Chart this network too; may be given again.",
 )
 @click.option("--only", default="", metavar="TEXT", help="Only methods with this in their name.")
+@click.option("--peer", is_flag=True, help="Chart SPlisHSPlasH's WCSPH and DFSPH too.")
 @arch_option
 @threads_option
 def chart(
@@ -607,6 +608,7 @@ def chart(
     until: float | None,
     weights: tuple[Path, ...],
     only: str,
+    peer: bool,
     arch: str,
     threads: int | None,
 ) -> int:
@@ -622,7 +624,7 @@ def chart(
     check_output(out, "--out", b"scene,")
     check_plot(plot)
     scenes = [varied(find_scene(name), height, spacing) for name in scene_names]
-    methods = charting.asked(weights, only)
+    methods = charting.asked(weights, only, peer)
     rows = charting.main(scenes, until, out, methods, arch, threads)
     charting.print_tables(rows)
     if plot is not None:

@@ -11,13 +11,14 @@ import msgspec
 import taichi as ti
 
 from app.models import maker_of
+from app.peers import SOLVERS, Peer
 from nn.weights import Weights
 from taichi_sph.acceleration import AccelerationModel, Fluid
 from taichi_sph.implicit import implicit_for
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
 from taichi_sph.scene import NewtonianTable, Scene
-from taichi_sph.simulation import ModelMaker
+from taichi_sph.simulation import ModelMaker, Simulation
 from taichi_sph.wall import Wall
 
 
@@ -28,7 +29,7 @@ class Method:
     name: str
     curve: str
     model: str = "physics"
-    """One of app.models, or "ballistic"."""
+    """One of app.models, "ballistic", or one of app.peers."""
     spacing: float = 1.0
     """Times the scene's."""
     sound_speed_ratio: float | None = None
@@ -70,6 +71,17 @@ class Method:
             discretization=change(scene.discretization, **grid),
             blood=change(scene.blood, **blood),
         )
+
+    def simulation(self, scene: Scene) -> Simulation | Peer:
+        """What pours a scene by this method.
+
+        Raises:
+            InputError: the scene or the weights cannot be used.
+        """
+        scene = self.scene(scene)
+        if self.model in SOLVERS:
+            return Peer(scene, self.model, self.step_factor or 1.0)
+        return Simulation.from_scene(scene, self.maker(scene))
 
     def maker(self, scene: Scene) -> ModelMaker:
         """What makes the model, for a scene as `scene` gives it.
@@ -190,6 +202,16 @@ METHODS: tuple[Method, ...] = (
     Method("ballistic", "ballistic", "ballistic"),
     *_over_spacing(Method("pcnet", "pcnet, spacing", "pcnet")),
 )
+
+PEERS: tuple[Method, ...] = tuple(
+    method
+    for name in SOLVERS
+    for method in (
+        *_over_spacing(Method(name, f"{name}, spacing", name)),
+        Method(f"{name}, longest step", f"{name}, longest step", name, step_factor=None),
+    )
+)
+"""Other programs on the same blood."""
 
 
 def of_weights(path: Path) -> Method:

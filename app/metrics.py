@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from app.peers import Peer
 from taichi_sph.diagnostics import FEW, Diagnostics
 from taichi_sph.errors import RunError
 from taichi_sph.simulation import Simulation
@@ -47,7 +48,7 @@ def clumped_part(positions: np.ndarray, spacing: float) -> float:
 
 
 def broken_rule(
-    simulation: Simulation,
+    simulation: Simulation | Peer,
     figures: Diagnostics,
     blood: int,
     speed: float,
@@ -90,7 +91,7 @@ SETTLING = 0.1
 """Speed over the scene's that blood may gain where a start is not in balance."""
 
 
-def energy_given(simulation: Simulation) -> float:
+def energy_given(simulation: Simulation | Peer) -> float:
     """Kinetic energy of a start, what gravity can give to it in the lumen, and SETTLING's [J]."""
     scene = simulation.scene
     x, v = simulation.positions(), simulation.velocities()
@@ -154,7 +155,7 @@ class Trace:
     """Part at rest, of what is there: slower than RESTING of the scene's speed."""
 
     def note(
-        self, simulation: Simulation, figures: Diagnostics, blood: int, grid: Grid | None
+        self, simulation: Simulation | Peer, figures: Diagnostics, blood: int, grid: Grid | None
     ) -> None:
         """Add a frame of a pour of so many particles."""
         x, v = simulation.positions(), simulation.velocities().astype(float)
@@ -218,7 +219,7 @@ class Pour:
     """A simulation that is poured frame by frame, timed and judged; what has died stays so."""
 
     name: str
-    simulation: Simulation
+    simulation: Simulation | Peer
     trace: Trace
     grid: Grid | None = None
     rules: Rules | None = None

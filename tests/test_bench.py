@@ -24,7 +24,7 @@ def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for
 
 
 def test_a_peer_that_is_not_installed_is_one_sentence(monkeypatch):
-    monkeypatch.setattr(bench, "has_peer", lambda: False)
+    monkeypatch.setattr("app.peers.has_peer", lambda: False)
     with pytest.raises(InputError, match=r"^--peer: pysplishsplash is not installed"):
         bench.main([], peer=True)
 

@@ -77,8 +77,8 @@ def test_rows_survive_the_file(tmp_path):
 
 def test_what_fits_nothing_is_one_sentence():
     with pytest.raises(InputError, match=r"^--only nobody: no method has this in its name"):
-        asked([], "nobody")
-    assert {m.name for m in asked([], "2 rounds")} == {"implicit, 2 rounds"}
+        asked([], "nobody", False)
+    assert {m.name for m in asked([], "2 rounds", False)} == {"implicit, 2 rounds"}
 
 
 def test_methods_have_names_of_their_own_and_keep_the_volume_of_blood():
