@@ -37,8 +37,8 @@ MEASURES = {
 """What an error budget may be of: errors of the chart that a spacing has."""
 DEFAULT = ("drained", "energy")
 """What it is of if nobody says."""
-PROBED = ("implicit, spacing", "pcnet, spacing")
-"""Curves of the chart that are poured; methods of no curve here are judged by the first."""
+PROBED = ("implicit, 0 rounds", "pcnet, spacing")
+"""Curves of the chart that are poured if they are safe; other methods are judged by the first."""
 SAFE = 0.95
 """Part of the starts of the stability cases that a method must have lived through."""
 
@@ -162,6 +162,14 @@ def lived(trials: Sequence[Trial], method: Method) -> tuple[int, int]:
     return sum(not row.died for row in mine), len(mine)
 
 
+def unsafe(method: Method, trials: Sequence[Trial]) -> str:
+    """What the stability cases say against a method; empty if nothing."""
+    good, starts = lived(trials, method)
+    if good < SAFE * starts or not starts:
+        return f"lived through {good} of {starts} starts that the physics lives through"
+    return ""
+
+
 def errors_here(
     probes: Sequence[Probe], rows: Sequence[Row], measures: Sequence[str]
 ) -> dict[str, dict[str, float]]:
@@ -219,10 +227,7 @@ def reason(method: Method, own: Probe | None, rows: Sequence[Row], trials: Seque
     died = [row for row in rows if row.method == method.name and row.died]
     if own is None and died:
         return f"died on the chart ({died[0].scene}: {died[0].died})"
-    good, starts = lived(trials, method)
-    if good < SAFE * starts or not starts:
-        return f"lived through {good} of {starts} starts that the physics lives through"
-    return ""
+    return unsafe(method, trials)
 
 
 def choose(found: Sequence[Candidate], error: float, slowest: float) -> Candidate:
@@ -329,16 +334,16 @@ def advise(
         print(f"{scene.name}, {method.name}: {state}", file=sys.stderr)
         return shown
 
+    rows = read_rows(EVIDENCE / "chart.csv", Row)
+    trials = read_rows(EVIDENCE / "stability.csv", Trial)
     probes: list[Probe] = []
-    plain = [m for m in METHODS if m.curve in PROBED]
+    plain = [m for m in METHODS if m.curve in PROBED and not unsafe(m, trials)]
     for method in sorted(plain, key=lambda m: -m.spacing):  # cheap first
         try:
             probes.append(look(method))
         except InputError:  # too coarse for the vessel, say
             if method.spacing == 1.0:
                 raise
-    rows = read_rows(EVIDENCE / "chart.csv", Row)
-    trials = read_rows(EVIDENCE / "stability.csv", Trial)
     found = candidates(probes, rows, trials, measures)
     slowest = 1.0 / real_time if real_time else math.inf
     while True:

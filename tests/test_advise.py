@@ -82,7 +82,8 @@ def trials(name: str, deaths: int, case: str = "low column") -> list[Trial]:
     ]
 
 
-SAFE = [t for name in ("physics", "pcnet", "implicit") for t in trials(name, 0)]
+LONG = ("pcnet", "implicit, 0 rounds")
+SAFE = [t for name in ("physics", *LONG) for t in trials(name, 0)]
 
 
 def test_errors_of_first_order_are_found():
@@ -122,7 +123,7 @@ def test_errors_and_costs_of_candidates_follow_from_pours_and_chart():
         cost = poured(method).wall_per_simulated
         assert found[method.name].wall_per_simulated == cost
         if method.model == "implicit":
-            other = found[method.name.replace("implicit", "physics")]
+            other = found[method.name.replace("implicit, 0 rounds", "physics")]
             assert other.error == pytest.approx(2.0 * error)  # as on the chart
             assert other.wall_per_simulated == pytest.approx(4.0 * cost)
 
@@ -211,6 +212,22 @@ def test_what_dies_when_it_is_poured_gives_way(monkeypatch: pytest.MonkeyPatch):
     assert advice.method.spacing == 1.5  # RISE hypot(1/2, 1/2) = 0.14; at 2 it is 0.22
     assert "Cheaper, but not advised: physics died here: it leaked." in advice.text
     assert "25 % of the blood is at rest" in advice.text
+
+
+def test_what_is_not_safe_is_not_poured(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    def stand_in(work, job):
+        asked.append(job.method.name)
+        return poured(job.method)
+
+    dying = [t for t in SAFE if t.method != "pcnet"] + trials("pcnet", 2)
+    monkeypatch.setattr(study, "in_own_process", stand_in)
+    monkeypatch.setattr(study, "read_rows", lambda path, row: charted() if row is Row else dying)
+    advice = study.advise(SCENE, 0.21, ("energy",), None, 0.5, "cpu", None)
+    assert not any("pcnet" in name for name in asked)
+    assert "pcnet" not in advice.method.name
+    assert any(c.method.name == "pcnet" and c.unfit for c in advice.candidates)
 
 
 def test_the_evidence_has_every_listed_method():
