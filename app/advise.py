@@ -39,6 +39,8 @@ DEFAULT = ("drained", "energy")
 """What it is of if nobody says."""
 PROBED = ("implicit, 0 rounds", "pcnet, spacing")
 """Curves of the chart that are poured if they are safe; other methods are judged by the first."""
+LEAST_WEIGHT = 0.125
+"""Twice (1.25 - 1)^2."""
 SAFE = 0.95
 """Part of the starts of the stability cases that a method must have lived through."""
 
@@ -105,10 +107,11 @@ def expected(apart: dict[float, float]) -> dict[float, float]:
 
     An error of C s leaves C (s - 1) between two pours: C by least squares, and C/2 is the error at
     spacing 1.  Coarser ones have what was seen beside it, as two errors that know nothing of each
-    other.  NaN if nothing coarser was poured.
+    other.  If only 1.25 was poured, the difference is mostly chance and is itself the error.  NaN if
+    nothing coarser was poured.
     """
-    weight = sum((s - 1.0) ** 2 for s in apart)
-    rise = sum(e * (s - 1.0) for s, e in apart.items()) / weight if weight else math.nan
+    weight = max(sum((s - 1.0) ** 2 for s in apart), LEAST_WEIGHT)
+    rise = sum(e * (s - 1.0) for s, e in apart.items()) / weight if apart else math.nan
     return {s: math.hypot(e, 0.5 * rise) for s, e in ({1.0: 0.0} | apart).items()}
 
 

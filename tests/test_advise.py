@@ -92,6 +92,7 @@ def test_errors_of_first_order_are_found():
     assert found[1.0] == pytest.approx(0.15)
     assert found[2.0] == pytest.approx(math.hypot(0.3, 0.15))
     assert math.isnan(expected({})[1.0])
+    assert expected({1.25: 0.07})[1.0] == pytest.approx(0.07)
 
 
 def test_what_a_method_is_to_another_is_a_mean_over_scenes():
