@@ -107,8 +107,8 @@ def expected(apart: dict[float, float]) -> dict[float, float]:
 
     An error of C s leaves C (s - 1) between two pours: C by least squares, and C/2 is the error at
     spacing 1.  Coarser ones have what was seen beside it, as two errors that know nothing of each
-    other.  If only 1.25 was poured, the difference is mostly chance and is itself the error.  NaN if
-    nothing coarser was poured.
+    other.  If only 1.25 was poured, the difference is mostly chance and is itself the error.  NaN
+    if nothing coarser was poured.
     """
     weight = max(sum((s - 1.0) ** 2 for s in apart), LEAST_WEIGHT)
     rise = sum(e * (s - 1.0) for s, e in apart.items()) / weight if apart else math.nan
