@@ -39,8 +39,6 @@ DEFAULT = ("drained", "energy")
 """What it is of if nobody says."""
 PROBED = ("implicit, 0 rounds", "pcnet, spacing")
 """Curves of the chart that are poured if they are safe; other methods are judged by the first."""
-LEAST_WEIGHT = 0.125
-"""Twice (1.25 - 1)^2."""
 SAFE = 0.95
 """Part of the starts of the stability cases that a method must have lived through."""
 
@@ -107,11 +105,10 @@ def expected(apart: dict[float, float]) -> dict[float, float]:
 
     An error of C s leaves C (s - 1) between two pours: C by least squares, and C/2 is the error at
     spacing 1.  Coarser ones have what was seen beside it, as two errors that know nothing of each
-    other.  If only 1.25 was poured, the difference is mostly chance and is itself the error.  NaN
-    if nothing coarser was poured.
+    other.  NaN if nothing coarser was poured.
     """
-    weight = max(sum((s - 1.0) ** 2 for s in apart), LEAST_WEIGHT)
-    rise = sum(e * (s - 1.0) for s, e in apart.items()) / weight if apart else math.nan
+    weight = sum((s - 1.0) ** 2 for s in apart)
+    rise = sum(e * (s - 1.0) for s, e in apart.items()) / weight if weight else math.nan
     return {s: math.hypot(e, 0.5 * rise) for s, e in ({1.0: 0.0} | apart).items()}
 
 
@@ -301,7 +298,7 @@ def explain(
     ]
     for c in found:
         if c.unfit and c.error <= error and c.wall_per_simulated < chosen.wall_per_simulated:
-            lines.append(f"Cheaper, but not advised: {c.method.name} {c.unfit}.")
+            lines.append(f"Cheaper, but not advised: {c.method.name} ({c.unfit}).")
             break
     wanted = d * (0.5 + error / chosen.error * (chosen.method.spacing - 0.5)) if chosen.error else d
     if chosen.error > error and wanted > 0.55 * d:

@@ -92,7 +92,7 @@ def test_errors_of_first_order_are_found():
     assert found[1.0] == pytest.approx(0.15)
     assert found[2.0] == pytest.approx(math.hypot(0.3, 0.15))
     assert math.isnan(expected({})[1.0])
-    assert expected({1.25: 0.07})[1.0] == pytest.approx(0.07)
+    assert expected({1.25: 0.07})[1.0] == pytest.approx(0.14)
 
 
 def test_what_a_method_is_to_another_is_a_mean_over_scenes():
@@ -211,7 +211,7 @@ def test_what_dies_when_it_is_poured_gives_way(monkeypatch: pytest.MonkeyPatch):
     advice = study.advise(SCENE, 0.21, ("energy",), None, 0.5, "cpu", None)
     assert asked == [*(m.name for m in sorted(POURED, key=lambda m: -m.spacing)), "physics"]
     assert advice.method.spacing == 1.5  # RISE hypot(1/2, 1/2) = 0.14; at 2 it is 0.22
-    assert "Cheaper, but not advised: physics died here: it leaked." in advice.text
+    assert "Cheaper, but not advised: physics (died here: it leaked)." in advice.text
     assert "25 % of the blood is at rest" in advice.text
 
 
