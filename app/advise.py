@@ -290,8 +290,8 @@ def explain(
     lines = [
         f"{scene.name}: {chosen.method.name}, {shown.blood_particles} particles at "
         f"{1e3 * shown.spacing:.3g} mm, {verdict} {budget}.",
-        f"Expected: {' and '.join(MEASURES[m] for m in measures)} within "
-        f"{100 * chosen.error:.2g} % of a pour at {1e3 * d / 2:.3g} mm. Poured here to "
+        f"Expected: {' and '.join(MEASURES[m] for m in measures)} off by about "
+        f"{100 * chosen.error:.2g} % from a pour at {1e3 * d / 2:.3g} mm. Poured here to "
         f"{shown.until:g} s it lives, compressed by {100 * max(shown.trace.compression):.1f} % "
         f"at most, for {shown.wall_per_simulated:.3g} s a simulated s "
         f"({1.0 / shown.wall_per_simulated:.2g} x real time).",

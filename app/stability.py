@@ -493,6 +493,7 @@ def print_table(rows: Sequence[Row]) -> None:
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw the matrix, and how many live over time."""
+    import matplotlib
     from matplotlib.figure import Figure
 
     methods, cases = methods_of(rows), cases_of(rows)
@@ -515,6 +516,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     matrix.set_yticks(range(len(methods)), methods)
     matrix.set_xticks(range(len(cases)), cases, rotation=50, ha="right", fontsize=8)
     matrix.set_title("green: all starts live; number: compression [%], and leaks with a mark")
+    curves.set_prop_cycle(color=matplotlib.colormaps["tab20"].colors)  # type: ignore[attr-defined]
     for method in methods:
         trials = sum(row.method == method for row in rows)
         ended = [row.survived for row in rows if row.method == method and row.died]
