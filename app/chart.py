@@ -359,7 +359,7 @@ COLOURS = {
     "physics, Newtonian": "tab:purple",
     "soft physics, spacing": "magenta",
     "implicit, spacing": "tab:green",
-    "implicit, 0 rounds": "limegreen",
+    "implicit, 0 rounds": "teal",
     "implicit, rounds": "olive",
     "ballistic": "black",
     "pcnet, spacing": "tab:red",
