@@ -217,7 +217,7 @@ def candidates(
         result.append(Candidate(method, error, cost, reason(method, own, rows, trials)))
         if math.isnan(error + cost) and not result[-1].unfit:
             result[-1] = replace(result[-1], unfit="not on the chart")
-    return sorted(result, key=lambda c: c.wall_per_simulated)
+    return sorted(result, key=lambda c: (math.isnan(c.wall_per_simulated), c.wall_per_simulated))
 
 
 def reason(method: Method, own: Probe | None, rows: Sequence[Row], trials: Sequence[Trial]) -> str:

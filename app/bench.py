@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.output import console, table, write_json
-from app.peers import begin, require_peer
+from app.peers import begin, require_peer, rigid_wall
 from app.processes import in_own_process
 from app.scenes import weights_for, with_column
 from taichi_sph.errors import InputError
@@ -293,20 +293,7 @@ def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, so
                 "scale": [1, 1, 1],
             }
         ],
-        "RigidBodies": [
-            {
-                "id": 1,
-                "geometryFile": str(folder / "tank.obj"),
-                "translation": [0, 0, 0],
-                "rotationAxis": [1, 0, 0],
-                "rotationAngle": 0,
-                "scale": [1, 1, 1],
-                "isDynamic": False,
-                "isWall": True,
-                "mapInvert": True,
-                "samplingMode": 0,
-            }
-        ],
+        "RigidBodies": [rigid_wall(folder / "tank.obj") | {"id": 1, "mapInvert": True}],
     }
     base = begin(scene, folder)
     import pysplishsplash as sph

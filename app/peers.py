@@ -23,7 +23,7 @@ import trimesh
 
 from taichi_sph import surface
 from taichi_sph.derived import derive
-from taichi_sph.diagnostics import Diagnostics, compression
+from taichi_sph.diagnostics import Diagnostics, diagnose
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import OPENING_REACH, SKIN
@@ -115,6 +115,20 @@ def wall_behind(vessel: Vessel, setback: float) -> trimesh.Trimesh:
         np.add.at(right, corner, setback * area)
     shift = np.linalg.pinv(square, rcond=0.05, hermitian=True) @ right[:, :, None]
     return trimesh.Trimesh(vertices + shift[:, :, 0], faces, process=False)
+
+
+def rigid_wall(surface: Path) -> dict[str, Any]:
+    """A wall of SPlisHSPlasH's scenes: a surface (OBJ) where it is, sampled by Poisson disks."""
+    return {
+        "geometryFile": str(surface),
+        "translation": [0, 0, 0],
+        "rotationAxis": [1, 0, 0],
+        "rotationAngle": 0,
+        "scale": [1, 1, 1],
+        "isDynamic": False,
+        "isWall": True,
+        "samplingMode": 0,
+    }
 
 
 def write_points(path: Path, points: np.ndarray) -> None:
@@ -229,18 +243,7 @@ class Peer:
                     "scale": [1, 1, 1],
                 }
             ],
-            "RigidBodies": [
-                {
-                    "geometryFile": str(folder / "wall.obj"),
-                    "translation": [0, 0, 0],
-                    "rotationAxis": [1, 0, 0],
-                    "rotationAngle": 0,
-                    "scale": [1, 1, 1],
-                    "isDynamic": False,
-                    "isWall": True,
-                    "samplingMode": 0,  # Poisson disk
-                }
-            ],
+            "RigidBodies": [rigid_wall(folder / "wall.obj")],
         }
 
     def _stable_step(self) -> float:
@@ -324,22 +327,6 @@ class Peer:
 
         Blood leaks where it is further out than its wall stands.
         """
-        velocity = self.velocities().astype(np.float64)
-        density, rest = self._in_order(self._density), self.scene.blood.density
-        p99, largest = compression(density, rest) if self.steps else (0.0, 0.0)
-        speed2 = (velocity**2).sum(axis=1)
         setback = SETBACK * self.scene.discretization.spacing
-        return Diagnostics(
-            time=self.time,
-            step=self.last_step,
-            particles=len(velocity),
-            drained=dict(self._drained),
-            drained_volume=sum(self._drained.values()) * self.particles.mass / rest,
-            leaks=self.vessel.count_leaks(self.positions(), setback) + self._lost,
-            wall_corrections=self.wall_corrections,
-            compression_p99=p99,
-            compression_max=largest,
-            kinetic_energy=float(0.5 * self.particles.mass * speed2.sum()),
-            max_speed=float(np.sqrt(speed2.max(initial=0.0))),
-            fallback_share=self.fallback_share,
-        )
+        leaks = self.vessel.count_leaks(self.positions(), setback) + self._lost
+        return diagnose(self, self._in_order(self._density), dict(self._drained), leaks)

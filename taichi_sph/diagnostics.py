@@ -1,6 +1,7 @@
 """What a frame says about the state of the blood."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -44,3 +45,34 @@ def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]
         return 0.0, 0.0
     excess = np.maximum(density / rest_density - 1.0, 0.0)
     return float(np.percentile(excess, 99)), float(excess.max())
+
+
+def diagnose(
+    simulation: Any, density: np.ndarray, drained: dict[str, int], leaks: int
+) -> Diagnostics:
+    """Figures of a simulation, ours or one that is read as ours is.
+
+    Args:
+        simulation: what moves the blood.
+        density: of the live blood [kg/m^3], (n,).
+        drained: particles that have left, by opening.
+        leaks: particles outside the lumen that no opening explains.
+    """
+    rest_density = simulation.scene.blood.density
+    velocity = simulation.velocities().astype(np.float64)
+    p99, largest = compression(density, rest_density) if simulation.steps else (0.0, 0.0)
+    speed2 = (velocity**2).sum(axis=1)
+    return Diagnostics(
+        time=simulation.time,
+        step=simulation.last_step,
+        particles=len(velocity),
+        drained=drained,
+        drained_volume=sum(drained.values()) * simulation.particles.mass / rest_density,
+        leaks=leaks,
+        wall_corrections=simulation.wall_corrections,
+        compression_p99=p99,
+        compression_max=largest,
+        kinetic_energy=float(0.5 * simulation.particles.mass * speed2.sum()),
+        max_speed=float(np.sqrt(speed2.max(initial=0.0))),
+        fallback_share=simulation.fallback_share,
+    )

@@ -8,7 +8,7 @@ import taichi as ti
 from taichi_sph.acceleration import AccelerationModel, Fluid, SphAcceleration
 from taichi_sph.calibration import calibrate
 from taichi_sph.derived import Derived, derive
-from taichi_sph.diagnostics import Diagnostics, compression
+from taichi_sph.diagnostics import Diagnostics, diagnose
 from taichi_sph.equation_of_state import Tait
 from taichi_sph.errors import InputError
 from taichi_sph.motion import Motion
@@ -203,21 +203,6 @@ class Simulation(Motion):
         removed = self._removed.to_numpy()
         names = [o.name for o in self.vessel.openings]
         drained = {name: int(n) for name, n in zip(names, removed, strict=False)}
-        velocity = self.velocities().astype(np.float64)
         density = self.particles.in_order(self.particles.density)
-        p99, largest = compression(density, self.scene.blood.density) if self.steps else (0.0, 0.0)
-        speed2 = (velocity**2).sum(axis=1)
-        return Diagnostics(
-            time=self.time,
-            step=self.last_step,
-            particles=len(velocity),
-            drained=drained,
-            drained_volume=sum(drained.values()) * self.particles.mass / self.scene.blood.density,
-            leaks=self.vessel.count_leaks(self.positions()) + int(removed[-1]),
-            wall_corrections=self.wall_corrections,
-            compression_p99=p99,
-            compression_max=largest,
-            kinetic_energy=float(0.5 * self.particles.mass * speed2.sum()),
-            max_speed=float(np.sqrt(speed2.max(initial=0.0))),
-            fallback_share=self.fallback_share,
-        )
+        leaks = self.vessel.count_leaks(self.positions()) + int(removed[-1])
+        return diagnose(self, density, drained, leaks)

@@ -140,6 +140,9 @@ def test_what_died_is_not_advised():
     rows = charted(**{"physics, 2 d": "compressed by 11 %"})
     probes = [poured(m, "it leaked" if m.name == "pcnet, 2 d" else "") for m in POURED]
     found = by_name(probes, rows, SAFE)
+    *costs, unknown = (c.wall_per_simulated for c in found.values())
+    assert math.isnan(unknown)  # of "physics, 2 d", whose death has no cost: it stands last
+    assert costs == sorted(costs)
     assert found["pcnet, 2 d"].unfit == "died here: it leaked"
     assert "compressed by 11 %" in found["physics, 2 d"].unfit
     assert found["pcnet"].unfit == ""
