@@ -110,23 +110,24 @@ def make_motion(
     fluid = liquid.fluid()
     kernel, skin = fluid.kernel, SKIN * fluid.kernel.support_radius
     reach = kernel.support_radius + skin
+    wall = Wall.from_numpy(
+        wall_position,
+        wall_normal,
+        kernel,
+        fluid.calibration.setback,
+        liquid.wall_spacing,
+        period if period.any() else None,
+    )
     return Motion(
         Particles.from_numpy(position, velocity, fluid.calibration.mass),
-        Wall.from_numpy(
-            wall_position,
-            wall_normal,
-            kernel,
-            fluid.calibration.setback,
-            liquid.wall_spacing,
-            period if period.any() else None,
-        ),
+        wall,
         Neighbors.allocate(
             make_grid(*box, reach, period),
             kernel.support_radius,
             skin,
             len(position),
             liquid.spacing,
-            liquid.wall_spacing,
+            wall,
         ),
         SphAcceleration(fluid, len(position)),
         body_force,

@@ -88,6 +88,7 @@ def kick_drift(
                 touched = 1
         corrected += ti.cast(touched, float)
         p.velocity[i] = v_new
-        ti.atomic_max(moved2, nb.grid.separation(x, nb.built_position[i]).norm_sqr())
+        built = ti.Vector([nb.built.x[i], nb.built.y[i], nb.built.z[i]])
+        ti.atomic_max(moved2, nb.grid.separation(x, built).norm_sqr())
         p.position[i] = nb.grid.wrap(x)
     return ti.Vector([moved2, corrected])

@@ -18,6 +18,13 @@ from taichi_sph.wall import Wall
 
 ROW_MULTIPLE = 8
 
+RUN = 32
+"""Candidates that are tested at a time: the bits of an integer."""
+
+REACH = (1, 1, 2)
+"""Cells to look at on each side along each axis.  Cells that follow along z are one run of rows,
+so half cells along z leave out what is too far there and cost nothing."""
+
 
 @ti.data_oriented
 @dataclass(frozen=True)
@@ -32,8 +39,8 @@ class Grid:
     """Number of cells along each axis."""
     period: tuple[float, float, float]
     """Length after which an axis repeats [m]; 0 where it does not."""
-    reach: int
-    """Cells to look at on each side."""
+    reach: tuple[int, int, int]
+    """Cells to look at on each side along each axis."""
 
     @property
     def cells(self) -> int:
@@ -82,17 +89,15 @@ def make_grid(
     upper: np.ndarray,
     radius: float,
     period: np.ndarray | None = None,
-    reach: int = 2,
+    reach: tuple[int, int, int] = REACH,
 ) -> Grid:
-    """A grid over the box lower..upper [m] for lists of a radius [m].
-
-    Cells of half the radius: a third fewer candidates than cells of the radius.
-    """
+    """A grid over the box lower..upper [m] for lists of a radius [m]."""
     period = np.zeros(3) if period is None else np.asarray(period, dtype=float)
     extent = np.where(period > 0.0, period, np.asarray(upper) - np.asarray(lower))
-    edge = radius / reach
-    if np.any((period > 0.0) & (period < (2 * reach + 1) * edge)):
-        raise ValueError(f"a periodic axis must be at least {2 * reach + 1} cells long")
+    edge = radius / np.array(reach)
+    across = 2 * np.array(reach) + 1
+    if np.any((period > 0.0) & (period < across * edge)):
+        raise ValueError(f"a periodic axis must be at least {across.min()} cells long")
     shape = np.maximum(1, np.floor(extent / edge * (1.0 + 1e-9))).astype(int)
     shape = np.where(period > 0.0, shape, shape + 1)
     cell = np.where(period > 0.0, extent / shape, edge)
@@ -144,6 +149,27 @@ def list_capacity(expected: float) -> int:
 
 
 @dataclass(eq=False)
+class Points:
+    """Positions in the order of the grid, coordinate by coordinate: many are tested at a time.
+
+    The fields are a run longer than needed, so that a run may begin at any row.
+    """
+
+    x: ti.Field
+    y: ti.Field
+    z: ti.Field
+    """Coordinates [m], shape (rows + RUN,)."""
+    cell_start: ti.Field
+    """First row of each cell in use, shape (cells in use + 1,)."""
+
+    @classmethod
+    def allocate(cls, rows: int, cells: int) -> "Points":
+        """Fields for a number of points in a number of cells."""
+        x, y, z = (ti.field(float, rows + RUN) for _ in range(3))
+        return cls(x, y, z, ti.field(int, cells + 1))
+
+
+@dataclass(eq=False)
 class Neighbors:
     """Neighbour lists of the blood: blood_index[i, :blood_count[i]], likewise for proxies.
 
@@ -164,13 +190,12 @@ class Neighbors:
     wall_index: ti.Field
     rank: ti.Field
     """How many of the cells in use come before each cell, shape (cells + 1,)."""
-    cell_start: ti.Field
-    """First row of each cell in use, shape (cells in use + 1,)."""
-    wall_cell_start: ti.Field
+    built: Points
+    """Blood where it was when the lists were built."""
+    proxies: Points
     order: ti.Field
-    built_position: ti.MatrixField
-    """Where each particle was when the lists were built [m]."""
-    row_vector: ti.MatrixField
+    row_velocity: ti.MatrixField
+    row_acceleration: ti.MatrixField
     row_identity: ti.Field
     parallel_scan: ti.algorithms.PrefixSumExecutor | None = None
     """Running sum over cells on CUDA, the only place where Taichi has a parallel one."""
@@ -180,9 +205,9 @@ class Neighbors:
     @classmethod
     def allocate(
         cls, grid: Grid, support_radius: float, skin: float, capacity: int,
-        spacing: float, wall_spacing: float, used: np.ndarray | None = None,
+        spacing: float, wall: Wall, used: np.ndarray | None = None,
     ) -> "Neighbors":  # fmt: skip
-        """Make the fields for `capacity` particles of a spacing and a wall spacing [m].
+        """Make the fields for `capacity` particles of a spacing [m] beside a wall.
 
         `used` says which cells blood can be in, all if None.  A stray particle elsewhere counts as
         in the next cell in use: it may miss others that strayed with it, and nothing else.
@@ -194,23 +219,23 @@ class Neighbors:
         reach = support_radius + skin
         blood = list_capacity(4.0 / 3.0 * math.pi * (reach / spacing) ** 3)
         # In a narrow tube or a corner twice a plane wall's proxies lie within reach.
-        wall = list_capacity(2.0 * math.pi * (reach / wall_spacing) ** 2)
+        walls = list_capacity(2.0 * math.pi * (reach / wall.spacing) ** 2)
         return cls(
             grid=grid,
             support_radius=support_radius,
             skin=skin,
             blood_capacity=blood,
-            wall_capacity=wall,
+            wall_capacity=walls,
             blood_count=ti.field(int, capacity),
             blood_index=ti.field(int, (capacity, blood)),
             wall_count=ti.field(int, capacity),
-            wall_index=ti.field(int, (capacity, wall)),
+            wall_index=ti.field(int, (capacity, walls)),
             rank=rank,
-            cell_start=ti.field(int, cells + 1),
-            wall_cell_start=ti.field(int, cells + 1),
+            built=Points.allocate(capacity, cells),
+            proxies=Points.allocate(wall.count, cells),
             order=ti.field(int, capacity),
-            built_position=ti.Vector.field(3, float, capacity),
-            row_vector=ti.Vector.field(3, float, capacity),
+            row_velocity=ti.Vector.field(3, float, capacity),
+            row_acceleration=ti.Vector.field(3, float, capacity),
             row_identity=ti.field(int, capacity),
             parallel_scan=(
                 ti.algorithms.PrefixSumExecutor(cells + 1) if ti.cfg.arch == ti.cuda else None
@@ -219,20 +244,23 @@ class Neighbors:
 
     def sort_wall(self, wall: Wall) -> None:
         """Put the proxies in the order of the grid; again only when the wall changes."""
-        self.wall_cell_start.fill(0)
+        proxies = self.proxies
+        proxies.cell_start.fill(0)
         if wall.count == 0:
             return
         x = wall.position.to_numpy()
         c = np.floor((x - np.asarray(self.grid.lower)) / np.asarray(self.grid.cell)).astype(int)
         c = np.clip(c, 0, np.asarray(self.grid.shape) - 1)
         cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]
-        cells = self.wall_cell_start.shape[0] - 1
+        cells = proxies.cell_start.shape[0] - 1
         cell = np.minimum(self.rank.to_numpy()[cell], cells - 1)
         order = np.argsort(cell, kind="stable")
         for field in (wall.position, wall.normal, wall.volume):
             field.from_numpy(np.ascontiguousarray(field.to_numpy()[order]))
+        for field, coordinate in zip((proxies.x, proxies.y, proxies.z), x[order].T, strict=True):
+            field.from_numpy(np.pad(coordinate, (0, field.shape[0] - len(coordinate))))
         start = np.searchsorted(cell[order], np.arange(cells + 1))
-        self.wall_cell_start.from_numpy(start.astype(np.int32))
+        proxies.cell_start.from_numpy(start.astype(np.int32))
 
     def build(self, particles: Particles, wall: Wall) -> None:
         """Drop removed particles (identity < 0), sort the rest and build the lists anew.
@@ -242,23 +270,18 @@ class Neighbors:
         """
         count_cells(particles, self)
         if self.parallel_scan is None:
-            scan_serial(self.cell_start)
+            scan_serial(self.built.cell_start)
         else:
-            self.parallel_scan.run(self.cell_start)
-        fill_cells(particles, self)
-        particles.count[None] = self.cell_start[self.cell_start.shape[0] - 1]
-        sort_cells(particles, self)
-        reorder_vectors(particles.position, particles, self)
-        reorder_vectors(particles.velocity, particles, self)
-        reorder_vectors(particles.acceleration, particles, self)
-        reorder_identities(particles, self)
+            self.parallel_scan.run(self.built.cell_start)
+        sort_rows(particles, self)
+        reorder(particles, self)
         longest = build_lists(particles, wall, self)
         self.builds += 1
         for kind, found, capacity in (
             ("blood", int(longest[0]), self.blood_capacity),
             ("wall", int(longest[1]), self.wall_capacity),
         ):
-            if found >= capacity:  # the last slot is written by candidates that are not near
+            if found > capacity:
                 raise RunError(
                     f"a blood particle has {found} {kind} neighbours within "
                     f"{self.support_radius + self.skin:.3g} m, the list holds {capacity}: "
@@ -269,18 +292,18 @@ class Neighbors:
 @ti.func
 def cell_in_use(nb: ti.template(), x):
     """Cell of a position among those in use."""
-    return ti.min(nb.rank[nb.grid.index(nb.grid.cell_of(x))], nb.cell_start.shape[0] - 2)
+    return ti.min(nb.rank[nb.grid.index(nb.grid.cell_of(x))], nb.built.cell_start.shape[0] - 2)
 
 
 @ti.kernel
 def count_cells(p: ti.template(), nb: ti.template()):
-    """Histogram over cells, shifted by one; removed particles left out.  Writes: nb.cell_start."""
-    for c in nb.cell_start:
-        nb.cell_start[c] = 0
+    """Histogram over cells, shifted by one, without removed particles.  Writes: cell_start."""
+    for c in nb.built.cell_start:
+        nb.built.cell_start[c] = 0
     for i in range(p.count[None]):
         nb.blood_count[i] = 0
         if p.identity[i] >= 0:
-            ti.atomic_add(nb.cell_start[cell_in_use(nb, p.position[i]) + 1], 1)
+            ti.atomic_add(nb.built.cell_start[cell_in_use(nb, p.position[i]) + 1], 1)
 
 
 @ti.kernel
@@ -294,21 +317,19 @@ def scan_serial(a: ti.template()):
 
 
 @ti.kernel
-def fill_cells(p: ti.template(), nb: ti.template()):
-    """Rows by cell, in any order inside a cell.  Writes: nb.order; counts in nb.blood_count."""
+def sort_rows(p: ti.template(), nb: ti.template()):
+    """Rows by cell, and by identity inside a cell (insertion sort).
+
+    Writes: nb.order, p.count; counts in nb.blood_count.
+    """
     for i in range(p.count[None]):
         if p.identity[i] >= 0:
-            first = nb.cell_start[cell_in_use(nb, p.position[i])]
+            first = nb.built.cell_start[cell_in_use(nb, p.position[i])]
             # A particle's slot is taken on the counter of the cell's first row.
             nb.order[first + ti.atomic_add(nb.blood_count[first], 1)] = i
-
-
-@ti.kernel
-def sort_cells(p: ti.template(), nb: ti.template()):
-    """Rows of each cell by identity (insertion sort).  Reads and writes: nb.order."""
-    for c in range(nb.cell_start.shape[0] - 1):
-        first = nb.cell_start[c]
-        last = nb.cell_start[c + 1]
+    for c in range(nb.built.cell_start.shape[0] - 1):
+        first = nb.built.cell_start[c]
+        last = nb.built.cell_start[c + 1]
         for k in range(first + 1, last):
             row = nb.order[k]
             name = p.identity[row]
@@ -317,24 +338,54 @@ def sort_cells(p: ti.template(), nb: ti.template()):
                 nb.order[m + 1] = nb.order[m]
                 m -= 1
             nb.order[m + 1] = row
+    p.count[None] = nb.built.cell_start[nb.built.cell_start.shape[0] - 1]
 
 
 @ti.kernel
-def reorder_vectors(a: ti.template(), p: ti.template(), nb: ti.template()):
-    """Move the rows of a vector field into the order of the grid."""
+def reorder(p: ti.template(), nb: ti.template()):
+    """Move the rows of the state into the order of the grid.  Writes: nb.built too."""
     for i in range(p.count[None]):
-        nb.row_vector[i] = a[nb.order[i]]
+        row = nb.order[i]
+        x = p.position[row]
+        nb.built.x[i] = x[0]
+        nb.built.y[i] = x[1]
+        nb.built.z[i] = x[2]
+        nb.row_velocity[i] = p.velocity[row]
+        nb.row_acceleration[i] = p.acceleration[row]
+        nb.row_identity[i] = p.identity[row]
     for i in range(p.count[None]):
-        a[i] = nb.row_vector[i]
-
-
-@ti.kernel
-def reorder_identities(p: ti.template(), nb: ti.template()):
-    """Move the identities into the order of the grid."""
-    for i in range(p.count[None]):
-        nb.row_identity[i] = p.identity[nb.order[i]]
-    for i in range(p.count[None]):
+        p.position[i] = ti.Vector([nb.built.x[i], nb.built.y[i], nb.built.z[i]])
+        p.velocity[i] = nb.row_velocity[i]
+        p.acceleration[i] = nb.row_acceleration[i]
         p.identity[i] = nb.row_identity[i]
+
+
+@ti.func
+def near_bits(points: ti.template(), x, first, last, reach2):
+    """Bit k says that row first + k < last is nearer to x than the root of reach2.
+
+    The loop has no branch, no store and a fixed length: the CPU tests eight or sixteen at a time.
+    """
+    bits = 0
+    for k in range(RUN):
+        dx = x[0] - points.x[first + k]
+        dy = x[1] - points.y[first + k]
+        dz = x[2] - points.z[first + k]
+        bits |= ti.select(dx * dx + dy * dy + dz * dz < reach2, 1 << k, 0)
+    beyond = ti.max(0, RUN - (last - first))
+    return bits & ti.bit_shr(-1, beyond)
+
+
+@ti.func
+def append(bits, first, row, length, count, index: ti.template()):
+    """Add the rows of the bits to list `row`, as far as it has room; the new count."""
+    while bits != 0:
+        lowest = bits & -bits
+        if count < length:
+            index[row, count] = first + (RUN - 1) - ti.math.clz(lowest)
+        count += 1
+        bits ^= lowest
+    return count
 
 
 @ti.kernel
@@ -347,16 +398,15 @@ def build_lists(p: ti.template(), w: ti.template(), nb: ti.template()) -> ti.mat
     longest_wall = 0
     for i in range(p.count[None]):
         x_i = p.position[i]
-        nb.built_position[i] = x_i
         c = nb.grid.cell_of(x_i)
         reach2 = ti.static((nb.support_radius + nb.skin) ** 2)
         blood = 0
         walls = 0
         if ti.static(nb.grid.periodic):
             for dx, dy, dz in ti.ndrange(
-                (-nb.grid.reach, nb.grid.reach + 1),
-                (-nb.grid.reach, nb.grid.reach + 1),
-                (-nb.grid.reach, nb.grid.reach + 1),
+                (-nb.grid.reach[0], nb.grid.reach[0] + 1),
+                (-nb.grid.reach[1], nb.grid.reach[1] + 1),
+                (-nb.grid.reach[2], nb.grid.reach[2] + 1),
             ):
                 d = c + ti.Vector([dx, dy, dz])
                 inside = 1
@@ -368,40 +418,45 @@ def build_lists(p: ti.template(), w: ti.template(), nb: ti.template()) -> ti.mat
                 if inside == 1:
                     here = nb.rank[nb.grid.index(d)]
                     there = nb.rank[nb.grid.index(d) + 1]
-                    for j in range(nb.cell_start[here], nb.cell_start[there]):
+                    for j in range(nb.built.cell_start[here], nb.built.cell_start[there]):
                         if nb.grid.separation(x_i, p.position[j]).norm_sqr() < reach2 and j != i:
                             if blood < nb.blood_capacity:
                                 nb.blood_index[i, blood] = j
                             blood += 1
-                    for k in range(nb.wall_cell_start[here], nb.wall_cell_start[there]):
+                    for k in range(nb.proxies.cell_start[here], nb.proxies.cell_start[there]):
                         if nb.grid.separation(x_i, w.position[k]).norm_sqr() < reach2:
                             if walls < nb.wall_capacity:
                                 nb.wall_index[i, walls] = k
                             walls += 1
         else:
-            # Cells that follow along z are one run of rows.  Every candidate is written to the
-            # next slot and the slot taken only if it is near: no branch for the CPU to guess.
-            z0 = ti.max(c[2] - nb.grid.reach, 0)
-            z1 = ti.min(c[2] + nb.grid.reach, nb.grid.shape[2] - 1) + 1
+            # Cells that follow along z are one run of rows.
+            z0 = ti.max(c[2] - nb.grid.reach[2], 0)
+            z1 = ti.min(c[2] + nb.grid.reach[2], nb.grid.shape[2] - 1) + 1
             for cx in range(
-                ti.max(c[0] - nb.grid.reach, 0),
-                ti.min(c[0] + nb.grid.reach, nb.grid.shape[0] - 1) + 1,
+                ti.max(c[0] - nb.grid.reach[0], 0),
+                ti.min(c[0] + nb.grid.reach[0], nb.grid.shape[0] - 1) + 1,
             ):
                 for cy in range(
-                    ti.max(c[1] - nb.grid.reach, 0),
-                    ti.min(c[1] + nb.grid.reach, nb.grid.shape[1] - 1) + 1,
+                    ti.max(c[1] - nb.grid.reach[1], 0),
+                    ti.min(c[1] + nb.grid.reach[1], nb.grid.shape[1] - 1) + 1,
                 ):
                     row = (cx * nb.grid.shape[1] + cy) * nb.grid.shape[2]
                     here = nb.rank[row + z0]
                     there = nb.rank[row + z1]
-                    for j in range(nb.cell_start[here], nb.cell_start[there]):
-                        near = (x_i - p.position[j]).norm_sqr() < reach2
-                        nb.blood_index[i, ti.min(blood, ti.static(nb.blood_capacity - 1))] = j
-                        blood += ti.cast(near, int) & ti.cast(j != i, int)
-                    for k in range(nb.wall_cell_start[here], nb.wall_cell_start[there]):
-                        near = (x_i - w.position[k]).norm_sqr() < reach2
-                        nb.wall_index[i, ti.min(walls, ti.static(nb.wall_capacity - 1))] = k
-                        walls += ti.cast(near, int)
+                    j = nb.built.cell_start[here]
+                    last_j = nb.built.cell_start[there]
+                    while j < last_j:
+                        bits = near_bits(nb.built, x_i, j, last_j, reach2)
+                        if j <= i and i < j + RUN:
+                            bits &= ~(1 << (i - j))  # not itself
+                        blood = append(bits, j, i, nb.blood_capacity, blood, nb.blood_index)
+                        j += RUN
+                    k = nb.proxies.cell_start[here]
+                    last_k = nb.proxies.cell_start[there]
+                    while k < last_k:
+                        bits = near_bits(nb.proxies, x_i, k, last_k, reach2)
+                        walls = append(bits, k, i, nb.wall_capacity, walls, nb.wall_index)
+                        k += RUN
         nb.blood_count[i] = ti.min(blood, nb.blood_capacity)
         nb.wall_count[i] = ti.min(walls, nb.wall_capacity)
         ti.atomic_max(longest_blood, blood)

@@ -23,7 +23,7 @@ from taichi_sph.wall import Wall
 ModelMaker = Callable[[Fluid, int], AccelerationModel]
 """Makes a model for a fluid and a number of particles."""
 
-SKIN = 0.3
+SKIN = 0.1
 """Skin of the neighbour lists over the support radius: a wider one is built less often and holds
 more candidates.  Of 0.2, 0.3, 0.4 and 0.6, the physics pours fastest with 0.2 and 0.3 and PcNet,
 whose steps are longer, with 0.3 and 0.4 (aortoiliac, 4 151 particles)."""
@@ -104,7 +104,7 @@ class Simulation(Motion):
             skin,
             len(blood),
             grid.spacing,
-            wall_spacing,
+            wall,
             # The wall's proxies, and blood that leaves through an opening, are within this.
             cells_within(cells, vessel.signed_distance, margin),
         )

@@ -200,7 +200,7 @@ def _stage(lower, upper, period, reach, position, normal) -> Stage:
     wall = Wall.from_numpy(position, normal, KERNEL, calibration().setback, WALL_SPACING, period)
     neighbors = Neighbors.allocate(
         make_grid(np.array(lower), np.array(upper), R + SKIN, np.array(period), reach),
-        R, SKIN, CAPACITY, D, WALL_SPACING,
+        R, SKIN, CAPACITY, D, wall,
     )  # fmt: skip
     neighbors.sort_wall(wall)
     return Stage(_particles(), wall, neighbors, position, normal)
@@ -210,7 +210,7 @@ def _stage(lower, upper, period, reach, position, normal) -> Stage:
 def periodic() -> Stage:
     """A cube that repeats along every axis, no wall, cells as wide as the lists reach."""
     return _stage(
-        (0, 0, 0), (BOX, BOX, BOX), (BOX, BOX, BOX), 1, np.zeros((0, 3)), np.zeros((0, 3))
+        (0, 0, 0), (BOX, BOX, BOX), (BOX, BOX, BOX), (1, 1, 1), np.zeros((0, 3)), np.zeros((0, 3))
     )
 
 
@@ -225,7 +225,7 @@ def plane() -> Stage:
         position.append(np.column_stack([grid, np.full(len(grid), height + up * setback)]))
         normal.append(np.tile([0.0, 0.0, up], (len(grid), 1)))
     return _stage(
-        (0, 0, -2 * R), (BOX, BOX, 20 * D), (BOX, BOX, 0.0), 2,
+        (0, 0, -2 * R), (BOX, BOX, 20 * D), (BOX, BOX, 0.0), (2, 2, 2),
         np.concatenate(position), np.concatenate(normal),
     )  # fmt: skip
 
@@ -241,7 +241,7 @@ def sphere() -> Stage:
         [np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)]
     )
     edge = 9.1 * D
-    return _stage((-edge,) * 3, (edge,) * 3, (0.0,) * 3, 2, radius * normal, normal)
+    return _stage((-edge,) * 3, (edge,) * 3, (0.0,) * 3, (1, 1, 2), radius * normal, normal)
 
 
 def cubic_lattice(*counts: int) -> np.ndarray:

@@ -126,7 +126,7 @@ def test_lists_are_good_for_every_step_of_a_run():
         n, nb = motion.particles.count[None], motion.neighbors
         assert n == count
         x = motion.particles.position.to_numpy()[:n].astype(float)
-        built = nb.built_position.to_numpy()[:n].astype(float)
+        built = np.stack([f.to_numpy()[:n] for f in (nb.built.x, nb.built.y, nb.built.z)], -1)
         distance = np.linalg.norm(separations(x, x, plane().period), axis=-1)
         np.fill_diagonal(distance, np.inf)
         listed = np.zeros((n, n), bool)

@@ -10,7 +10,6 @@ from builders import (
     CAPACITY,
     SKIN,
     SPHERE,
-    WALL_SPACING,
     D,
     R,
     Stage,
@@ -115,14 +114,14 @@ def test_cells_away_from_the_vessel_change_no_list():
     whole = stage.neighbors
     # Small cells, so that blocks of them are smaller than the round vessel.
     grid = make_grid(np.full(3, -20 * D), np.full(3, 25 * D), REACH / 2)
-    fine = replace(grid, reach=2 * grid.reach)
+    fine = replace(grid, reach=(2, 2, 4))
     used = cells_within(fine, lambda x: np.linalg.norm(x, axis=1) - SPHERE, 3.0 * D)
     assert used.mean() < 0.3
     corner = np.argwhere(used.reshape(fine.shape)) * np.array(fine.cell) + np.array(fine.lower)
     for axis in range(3):  # the vessel and its margin, to within a cell
         assert corner[:, axis].min() <= -SPHERE - 3.0 * D
         assert corner[:, axis].max() >= SPHERE + 3.0 * D - fine.cell[axis]
-    few = Neighbors.allocate(fine, R, SKIN, CAPACITY, D, WALL_SPACING, used)
+    few = Neighbors.allocate(fine, R, SKIN, CAPACITY, D, stage.wall, used)
     stage.put(ball(np.random.default_rng(5), SPHERE - 0.2 * D))
     stage.build()
     particles = stage.particles
