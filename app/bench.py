@@ -13,13 +13,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.output import console, table, write_json
+from app.output import check_plots, console, table, write_json
 from app.peers import begin, require_peer, rigid_wall
 from app.processes import in_own_process
 from app.scenes import weights_for, with_column
@@ -106,7 +106,7 @@ PAPER = {
 
 
 def measure_scene(
-    path: Path, particles: int | None, arch: str, threads: int | None, duration: float
+    scene: Scene, weights: Path, arch: str, threads: int | None, duration: float
 ) -> Pair:
     """Cost of a step over the first `duration` [s] of a scene: medians over blocks."""
     from nn.pcnet import load_pcnet
@@ -114,10 +114,8 @@ def measure_scene(
     from taichi_sph.vessel import read_vessel
 
     start(arch, threads=threads)
-    scene = with_column(read_scene(path), particles, None)
     vessel = read_vessel(scene)
-    weights = load_pcnet(weights_for(scene), scene)
-    sides = [Simulation(scene, vessel), Simulation(scene, vessel, weights)]
+    sides = [Simulation(scene, vessel), Simulation(scene, vessel, load_pcnet(weights, scene))]
     frame = sides[1].model.stable_step(0.0, 0.0)
     block = FRAMES_A_BLOCK * frame
     if round(duration / block) < 2:
@@ -149,61 +147,6 @@ def measure_scene(
         sides[0].steps / sides[1].steps, physics, pcnet, 1e3 * frames[0], 1e3 * frames[1],
         frames[0] / frames[1], *paper,
     )  # fmt: skip
-
-
-def measure_split(path: Path, weights: Path, arch: str, threads: int | None) -> dict[str, float]:
-    """Median cost of each pass of a step [ms], blood as it stands after 0.05 s of PcNet.
-
-    The hidden layers' own cost is what they add to a network that has none.
-    """
-    import taichi as ti
-
-    from nn.pcnet import PressurePcNet, load_pcnet
-    from nn.weights import Weights
-    from taichi_sph import Simulation, start
-    from taichi_sph.acceleration import sum_acceleration, sum_density
-    from taichi_sph.implicit import correct_pressure
-    from taichi_sph.integrator import kick_drift, survey
-
-    start(arch, threads=threads)
-    scene = read_scene(path)
-    simulation = Simulation.from_scene(scene, load_pcnet(weights, scene))
-    simulation.advance_to(0.05)
-    net = simulation.model
-    assert isinstance(net, PressurePcNet)
-    full = Weights.load(weights)
-    inputs = full.sizes[0]
-    flat = replace(full, layers=((np.zeros((3, inputs), np.float32), np.zeros(3, np.float32)),))
-    shallow = PressurePcNet(flat, net.physics.fluid, net.scales, simulation.particles.capacity)
-    p, w, nb = simulation.particles, simulation.wall, simulation.neighbors
-    fluid, scratch = net.physics.fluid, (net.physics.pressure_term, net.physics.viscosity)
-    gravity = ti.Vector(scene.gravity)
-    passes: dict[str, Callable[[], Any]] = {
-        "neighbour search": lambda: nb.build(p, w),
-        "physics: density, shear rate": lambda: sum_density(p, w, nb, fluid, *scratch),
-        "physics: forces": lambda: sum_acceleration(
-            p, w, nb, fluid, *scratch, net.physics.stress, gravity
-        ),
-        "PcNet: features and network": lambda: net.guess(p, w, nb),
-        "PcNet: features, no hidden layer": lambda: shallow.guess(p, w, nb),
-        "PcNet: forces": lambda: sum_acceleration(
-            p, w, nb, net.fluid, *scratch, net.physics.stress, gravity
-        ),
-        "PcNet: correction": lambda: correct_pressure(
-            p, w, nb, net.fluid, net.interval, net.response, net.physics.pressure_term
-        ),
-        "survey": lambda: survey(p),
-        "integration, wall": lambda: kick_drift(p, w, nb, False, 0.0),
-    }
-    times: dict[str, list[float]] = {name: [] for name in passes}
-    for turn in range(1 + BLOCK):
-        for name, work in passes.items():
-            before = time.perf_counter()
-            work()
-            ti.sync()
-            if turn:  # the first compiles
-                times[name].append(time.perf_counter() - before)
-    return {name: 1e3 * float(np.median(taken)) for name, taken in times.items()}
 
 
 def _box_scene(across: int, height: int, fill: int, wall_ratio: float, folder: Path) -> Scene:
@@ -422,6 +365,8 @@ def main(
     scale: bool = False,
     start_up: bool = False,
     split: bool = False,
+    real_time: bool = False,
+    plot: Path | None = None,
     json_file: Path | None = None,
 ) -> int:
     """Measure and print; returns the exit code.
@@ -431,12 +376,16 @@ def main(
     """
     if peer:
         require_peer()
+    if plot is not None:
+        check_plots(plot)
     terminal = console()
     machine = _machine(arch, threads)
     terminal.print(", ".join(f"{key} {value}" for key, value in machine.items()))
     pairs: list[Pair] = []
     for path, particles in scenes:
-        pairs.append(in_own_process(measure_scene, path, particles, arch, threads, until))
+        scene = with_column(read_scene(path), particles, None)
+        weights = weights_for(scene)
+        pairs.append(in_own_process(measure_scene, scene, weights, arch, threads, until))
     rows: list[Row] = [row for pair in pairs for row in (pair.physics, pair.pcnet)]
     if pairs:
         terminal.print(table_1(pairs))
@@ -461,23 +410,49 @@ def main(
             f"blood particles: {min(costs):.3f} to {max(costs):.3f} us, "
             f"{max(costs) / min(costs) - 1:.0%} apart"
         )
+    paths = list(dict.fromkeys(path for path, _ in scenes))
     starts = {}
     if start_up:
-        for path in dict.fromkeys(path for path, _ in scenes):
+        for path in paths:
             starts[str(path)] = measure_start(str(path), arch)
             cold, warm = starts[str(path)]
             name = read_scene(path).name
             notes.append(f"{name} to the first step: {cold:.1f} s cold, {warm:.1f} s warm")
-    passes = {}
+    passes: list[Any] = []
+    limits: Any = None
     if split:
-        for path in dict.fromkeys(path for path, _ in scenes):
+        from app import passes as profile
+
+        for path in paths:
             scene = read_scene(path)
-            passes[scene.name] = in_own_process(
-                measure_split, path, weights_for(scene), arch, threads
-            )
-            notes += [
-                f"{scene.name}, {name}: {ms:.2f} ms" for name, ms in passes[scene.name].items()
+            weights = weights_for(scene)
+            some, limits = in_own_process(profile.measure_passes, scene, weights, arch, threads)
+            passes += some
+        terminal.print(profile.passes_table(passes, limits))
+        if plot is not None:
+            profile.draw(passes, limits, plot / "passes.png")
+    curves: list[Any] = []
+    if real_time:
+        from app import realtime
+
+        for path in paths:
+            scene = read_scene(path)
+            weights = weights_for(scene)
+            sizes = [
+                in_own_process(
+                    measure_scene, realtime.divided(scene, n), weights, arch, threads, until
+                )
+                for n in realtime.COUNTS
             ]
+            curves += realtime.curves(
+                scene,
+                weights,
+                [pair.physics.step_ms for pair in sizes],
+                [pair.pcnet.step_ms for pair in sizes],
+            )
+        terminal.print(realtime.curves_table(curves))
+        if plot is not None:
+            realtime.draw(curves, plot / "real_time.png")
     costs_table = table(
         "cost of a step, neighbour search included",
         "case", "blood", "proxies", "step ms", "quartiles", "us/particle", "real time", "MiB",
@@ -499,10 +474,12 @@ def main(
     if json_file:
         result = {"machine": machine, "table": [asdict(p) for p in pairs]}
         result |= {"rows": [asdict(r) for r in rows], "starts": starts}
-        result["passes"] = passes
+        result |= {"passes": [asdict(p) for p in passes]}
+        result |= {"limits": asdict(limits) if split else {}}
+        result |= {"real_time": [asdict(curve) for curve in curves]}
         write_json(json_file, result)
     return 0
 
 
-COLUMNS = ((20, 40), (32, 61), (50, 100))
-"""Columns of --scale: particles across and high; 16 000, 62 464 and 250 000."""
+COLUMNS = ((20, 40), (32, 61), (50, 100), (80, 157))
+"""Columns of --scale: particles across and high; 16 000, 62 464, 250 000 and 1 004 800."""

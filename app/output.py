@@ -1,6 +1,7 @@
 """Files that a run leaves: checked before the slow part, written whole or not at all."""
 
 import csv
+import importlib.util
 import io
 import json
 import math
@@ -16,6 +17,22 @@ from rich.console import Console
 from rich.table import Table
 
 from taichi_sph.errors import InputError
+
+
+def check_plots(folder: Path) -> None:
+    """Make a folder for pictures.
+
+    Raises:
+        InputError: it cannot be made, or nothing can be drawn.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError(
+            f"--plot {folder}: matplotlib is not installed; pip install 'vesselflow[plot]'"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--plot {folder}: cannot be made: {error.strerror}") from None
 
 
 def check_output(path: Path, option: str, begins: bytes) -> None:

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from app import flows
 from app.flows import DENSITY, Liquid, State, state_of
+from app.output import check_plots
 from taichi_sph import analytic
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.motion import Motion
@@ -604,16 +605,7 @@ def main(
     if unknown:
         raise InputError(f"--only {unknown[0]}: allowed are {', '.join(names)}")
     if plot is not None:
-        try:
-            import matplotlib  # noqa: F401
-        except ImportError:
-            raise InputError(
-                f"--plot {plot}: matplotlib is not installed; install vesselflow[plot]"
-            ) from None
-        try:
-            plot.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"--plot {plot}: cannot be made: {error.strerror}") from None
+        check_plots(plot)
     rows: list[Row] = []
     files: list[Path] = []
     progress = Progress(

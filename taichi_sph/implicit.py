@@ -85,9 +85,7 @@ class ImplicitAcceleration:
         sums, own = (particles, wall, neighbors, self.fluid), self.physics
         self.guess(particles, wall, neighbors)
         for remaining in range(self.rounds, -1, -1):
-            sum_acceleration(
-                *sums, own.pressure_term, own.viscosity, own.stress, ti.Vector(gravity)
-            )
+            sum_acceleration(*sums, own.pressure_term, own.viscosity, own.stress, *gravity)
             if remaining:
                 correct_pressure(*sums, self.interval, self.response, own.pressure_term)
 
