@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,6 +193,14 @@ def measure_column(across: int, fill: int, arch: str, threads: int | None) -> Ro
     return _row(
         simulation.scene.name, d.blood_particles, d.proxy_particles, costs, simulation.last_step
     )
+
+
+def _step_costs(
+    weights: Path, arch: str, threads: int | None, until: float, scene: Scene
+) -> tuple[float, float]:
+    """What a step costs the physics and PcNet [ms]."""
+    pair = in_own_process(measure_scene, scene, weights, arch, threads, until)
+    return pair.physics.step_ms, pair.pcnet.step_ms
 
 
 def _blocks(step: Callable[[], Any], count: int) -> float:
@@ -410,6 +419,24 @@ def main(
             f"blood particles: {min(costs):.3f} to {max(costs):.3f} us, "
             f"{max(costs) / min(costs) - 1:.0%} apart"
         )
+    costs_table = table(
+        "cost of a step, neighbour search included",
+        "case", "blood", "proxies", "step ms", "quartiles", "us/particle", "real time", "MiB",
+    )  # fmt: skip
+    for row in rows:
+        costs_table.add_row(
+            row.case,
+            str(row.blood_particles),
+            str(row.proxy_particles),
+            f"{row.step_ms:.2f}",
+            f"{row.step_ms_low:.2f}-{row.step_ms_high:.2f}",
+            f"{row.microseconds_per_particle_step:.3f}",
+            f"{row.real_time_factor:.5f}",
+            f"{row.memory_mib:.0f}",
+        )
+    terminal.print(costs_table)
+    for note in notes:
+        terminal.print(note)
     paths = list(dict.fromkeys(path for path, _ in scenes))
     starts = {}
     if start_up:
@@ -417,7 +444,7 @@ def main(
             starts[str(path)] = measure_start(str(path), arch)
             cold, warm = starts[str(path)]
             name = read_scene(path).name
-            notes.append(f"{name} to the first step: {cold:.1f} s cold, {warm:.1f} s warm")
+            terminal.print(f"{name} to the first step: {cold:.1f} s cold, {warm:.1f} s warm")
     passes: list[Any] = []
     limits: Any = None
     if split:
@@ -438,39 +465,11 @@ def main(
         for path in paths:
             scene = read_scene(path)
             weights = weights_for(scene)
-            sizes = [
-                in_own_process(
-                    measure_scene, realtime.divided(scene, n), weights, arch, threads, until
-                )
-                for n in realtime.COUNTS
-            ]
-            curves += realtime.curves(
-                scene,
-                weights,
-                [pair.physics.step_ms for pair in sizes],
-                [pair.pcnet.step_ms for pair in sizes],
-            )
+            cost = partial(_step_costs, weights, arch, threads, until)
+            curves += realtime.curves(scene, weights, cost)
         terminal.print(realtime.curves_table(curves))
         if plot is not None:
             realtime.draw(curves, plot / "real_time.png")
-    costs_table = table(
-        "cost of a step, neighbour search included",
-        "case", "blood", "proxies", "step ms", "quartiles", "us/particle", "real time", "MiB",
-    )  # fmt: skip
-    for row in rows:
-        costs_table.add_row(
-            row.case,
-            str(row.blood_particles),
-            str(row.proxy_particles),
-            f"{row.step_ms:.2f}",
-            f"{row.step_ms_low:.2f}-{row.step_ms_high:.2f}",
-            f"{row.microseconds_per_particle_step:.3f}",
-            f"{row.real_time_factor:.5f}",
-            f"{row.memory_mib:.0f}",
-        )
-    terminal.print(costs_table)
-    for note in notes:
-        terminal.print(note)
     if json_file:
         result = {"machine": machine, "table": [asdict(p) for p in pairs]}
         result |= {"rows": [asdict(r) for r in rows], "starts": starts}

@@ -6,7 +6,7 @@ speed: scaled by its square, a pour is the same but for the time that it takes.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +18,7 @@ from app.output import table
 from app.scenes import varied, with_column
 from nn.weights import Weights
 from taichi_sph.derived import derive, expected_speed
+from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
 from taichi_sph.vessel import read_vessel
 
@@ -86,30 +87,48 @@ def largest_in_real_time(
 
 
 def curves(
-    scene: Scene, weights: Path, physics_ms: Sequence[float], pcnet_ms: Sequence[float]
+    scene: Scene, weights: Path, cost: Callable[[Scene], tuple[float, float]]
 ) -> list[Curve]:
-    """The curve of each model, from the costs of a step at COUNTS [ms]."""
+    """The curve of each model.
+
+    Args:
+        scene: whose blood is divided.
+        weights: of PcNet.
+        cost: what a step of a scene costs the physics and PcNet [ms].
+
+    Raises:
+        InputError: the vessel is too narrow for every size.
+    """
     learned = Weights.load(weights)
-    scenes = [divided(scene, n) for n in COUNTS]
-    by_speed = [[steps(each, learned, speed) for each in scenes] for speed in SPEEDS]
+    sizes, scenes = [], []
+    for n in COUNTS:
+        each = divided(scene, n)
+        try:
+            read_vessel(each)
+        except InputError:  # too coarse for the narrowest place
+            if n == COUNTS[-1]:
+                raise
+            continue
+        sizes.append(n)
+        scenes.append(each)
+    costs = np.array([cost(each) for each in scenes])
+    longest = np.array([[steps(each, learned, speed) for each in scenes] for speed in SPEEDS])
     return [
         Curve(
-            scene.name, model, COUNTS, tuple(cost), SPEEDS,
+            scene.name, model, tuple(sizes), tuple(costs[:, side]), SPEEDS,
             tuple(
-                largest_in_real_time(
-                    COUNTS, 1e-3 * np.array(cost), np.array([s[side] for s in at_speed])
-                )
-                for at_speed in by_speed
+                largest_in_real_time(sizes, 1e-3 * costs[:, side], at_speed[:, side])
+                for at_speed in longest
             ),
         )
-        for side, (model, cost) in enumerate((("physics", physics_ms), ("pcnet", pcnet_ms)))
+        for side, model in enumerate(("physics", "pcnet"))
     ]  # fmt: skip
 
 
-def _words(particles: float) -> str:
-    if math.isinf(particles):
-        return f"> {COUNTS[-1]}"
-    return f"{particles:.0f}" if particles else f"< {COUNTS[0]}"
+def _words(curve: Curve, largest: float) -> str:
+    if math.isinf(largest):
+        return f"> {curve.particles[-1]}"
+    return f"{largest:.0f}" if largest else f"< {curve.particles[0]}"
 
 
 def curves_table(found: Sequence[Curve]) -> "Table":
@@ -119,7 +138,7 @@ def curves_table(found: Sequence[Curve]) -> "Table":
         "scene", "model", *(f"{speed:g}" for speed in SPEEDS),
     )  # fmt: skip
     for curve in found:
-        rows.add_row(curve.scene, curve.model, *map(_words, curve.largest))
+        rows.add_row(curve.scene, curve.model, *(_words(curve, n) for n in curve.largest))
     return rows
 
 
