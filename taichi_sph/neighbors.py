@@ -382,7 +382,8 @@ def append(bits, first, row, length, count, index: ti.template()):
     while bits != 0:
         lowest = bits & -bits
         if count < length:
-            index[row, count] = first + (RUN - 1) - ti.math.clz(lowest)
+            # The zeros below the lowest bit; counting those above goes wrong on Metal for bit 31.
+            index[row, count] = first + ti.math.popcnt(lowest - 1)
         count += 1
         bits ^= lowest
     return count
