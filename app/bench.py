@@ -453,8 +453,9 @@ def main(
         for path in paths:
             scene = read_scene(path)
             weights = weights_for(scene)
-            some, limits = in_own_process(profile.measure_passes, scene, weights, arch, threads)
+            some, reached = in_own_process(profile.measure_passes, scene, weights, arch, threads)
             passes += some
+            limits = reached if limits is None else limits.best(reached)
         terminal.print(profile.passes_table(passes, limits))
         if plot is not None:
             profile.draw(passes, limits, plot / "passes.png")

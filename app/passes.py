@@ -74,6 +74,10 @@ class Limits:
     fetched: float
     """Numbers fetched through lists per second."""
 
+    def best(self, other: "Limits") -> "Limits":
+        """The higher of each."""
+        return Limits(max(self.operations, other.operations), max(self.fetched, other.fetched))
+
 
 @ti.kernel
 def multiply_add(x: ti.template(), out: ti.template()):

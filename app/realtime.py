@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 SPEEDS = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
 """Largest speed of the flow [m/s]: from a vein's to an artery's."""
-COUNTS = (1000, 2000, 4000, 8000, 16000)
+COUNTS = (500, 1000, 2000, 4000, 8000, 16000)
 """Particles that the same blood is divided into."""
 
 
