@@ -150,6 +150,15 @@ def cli() -> None:
     help="Weights of the network.  [default: pcnet.npz beside the scene, or the aorta's]",
 )
 @seed_option
+@click.option(
+    "--checkpoint",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Keep the state of every N-th frame in SCENE.checkpoint.npz, or in the file resumed.",
+)
+@click.option(
+    "--resume", type=output_path, metavar="FILE", help="Go on from a checkpoint of the same run."
+)
 def run(
     scene_name: str,
     frames: int | None,
@@ -167,10 +176,12 @@ def run(
     error: float,
     weights: Path | None,
     seed: int,
+    checkpoint: int | None,
+    resume: Path | None,
 ) -> int:
     """Simulate a scene."""
     from app.output import check_output, write_json
-    from app.scenes import find_scene, with_column
+    from app.scenes import find_scene, weights_for, with_column
 
     if frames is not None and until is not None:
         raise InputError("--frames and --until: give one of the two")
@@ -184,11 +195,21 @@ def run(
         raise InputError("--every: nothing is shown without --rrd or --live")
     if weights is not None and model != "pcnet":
         raise InputError("--weights: only --model pcnet has weights")
+    if (resume is not None or checkpoint is not None) and model == "auto":
+        raise InputError("--checkpoint and --resume: name the model, for auto may choose another")
+    if resume is not None and rrd is not None and rrd.exists() and rrd.stat().st_size:
+        raise InputError(f"--rrd {rrd}: holds the run so far; name another file for the rest")
+    kept = resume or Path(f"{scene.name}.checkpoint.npz")
+    if checkpoint is not None:
+        check_output(kept, "--checkpoint", b"PK")
     asked = click.get_current_context().get_parameter_source("error")
     if asked is not click.core.ParameterSource.DEFAULT and model != "auto":
         raise InputError("--error: only --model auto has a budget")
 
-    from app.drive import drive
+    import hashlib
+
+    from app.checkpoint import Checkpoint, Checkpointer
+    from app.drive import Observer, drive
     from app.models import maker_of
     from app.progress import Progress
     from taichi_sph.runtime import start
@@ -203,19 +224,35 @@ def run(
         maker = advice.method.maker(scene)
     else:
         maker = maker_of(model, scene, weights)
+    facts = {
+        "scene": scene.name, "scene_text": scene.text, "particles": particles, "height": height,
+        "model": model, "arch": arch, "precision": precision, "seed": seed, "version": version(),
+    }  # fmt: skip
+    if model == "pcnet":
+        content = (weights or weights_for(scene)).read_bytes()
+        facts["weights"] = hashlib.sha256(content).hexdigest()
+    begun = Checkpoint.read(resume) if resume else None
+    if begun is not None and resume is not None:
+        begun.require(facts, resume)
     start(arch, precision, threads, random_seed=seed)
     simulation = Simulation.from_scene(scene, maker, seed)
-    view = None
+    if begun is not None:
+        simulation.go_on_from(begun.state)
+    observers: list[Observer] = []
+    if checkpoint is not None:
+        observers.append(Checkpointer(kept, checkpoint, facts))
     if rrd is not None or live is not None:
         from app.view import RerunView
 
-        facts = {"arch": arch, "precision": precision, "seed": seed, "version": version()}
-        view = RerunView(simulation, rrd, live, every, facts)
+        shown = {key: facts[key] for key in ("arch", "precision", "seed", "version")}
+        view = RerunView(simulation, rrd, live, every, shown)
+        observers.append(view)
         if view.live:
             click.echo(f"live view: rerun --connect {view.live.url}", err=True)
     outcome = drive(
-        simulation, [view] if view else [], end, scene.frame_interval, Progress(end, scene.name)
-    )
+        simulation, observers, end, scene.frame_interval, Progress(end, scene.name),
+        begun.frame if begun else 0,
+    )  # fmt: skip
     click.echo(summary_text(outcome.summary))
     if rrd is not None and not isinstance(outcome.error, OSError):
         click.echo(

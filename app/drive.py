@@ -137,15 +137,17 @@ def drive(
     until: float,
     frame_interval: float,
     progress: Progress | None = None,
+    frame: int = 0,
 ) -> Outcome:
     """Run a simulation to a time, showing every frame to every observer.
 
     Args:
-        simulation: at its start.
+        simulation: at its start, or at the frame that it goes on from.
         observers: closed by the end of this, however the run ends.
         until: simulated time [s] to stop at; a vessel that has run empty ends it earlier.
         frame_interval: simulated time between frames [s].
         progress: where the state of the run is shown; nowhere if None.
+        frame: number of the first frame.
 
     Returns:
         the summary; with the error of a run that diverged or could not write its output, or the
@@ -157,8 +159,7 @@ def drive(
     stopped: int | None = None
     step_times: list[float] = []
     most_leaks, most_compression = 0, 0.0
-    began = time.perf_counter()
-    frame = 0
+    began, first_time = time.perf_counter(), simulation.time
     with signals.caught():
         figures = simulation.diagnostics()
         steps = simulation.steps
@@ -213,7 +214,7 @@ def drive(
         simulated_time=figures.time,
         wall_time=wall_time,
         median_step_ms=1e3 * statistics.median(step_times) if step_times else math.nan,
-        real_time_factor=figures.time / wall_time,
+        real_time_factor=(figures.time - first_time) / wall_time,
         leaks=figures.leaks,
         most_leaks=most_leaks,
         wall_corrections=figures.wall_corrections,

@@ -84,18 +84,23 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file so that it is either the old one or the whole new one.
+    """Write a text file, as `write_bytes`."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that it is either the old one or the whole new one.
 
     Raises:
         OSError: the disk is full, or the folder is gone.
     """
     if path.exists() and not path.is_file():
-        path.write_text(text)  # a device or a pipe: nothing to replace
+        path.write_bytes(content)  # a device or a pipe: nothing to replace
         return
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         umask = os.umask(0)

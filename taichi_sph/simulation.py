@@ -1,6 +1,7 @@
 """Simulation: the blood of a scene in its vessel."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -60,6 +61,32 @@ def mark_removed(
                 if outside and p.identity[i] >= 0:
                     p.identity[i] = LOST
                     ti.atomic_add(removed[centre.shape[0]], 1)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All that changes from step to step; rows in the order of the grid."""
+
+    time: float
+    """[s]"""
+    last_step: float
+    """[s]"""
+    fallback_time: float
+    """[s]"""
+    steps: int
+    wall_corrections: int
+    removed: np.ndarray
+    """Particles that left by each opening, then those lost, (openings + 1,)."""
+    identity: np.ndarray
+    """(n,)"""
+    position: np.ndarray
+    """[m], (n, 3)."""
+    velocity: np.ndarray
+    """[m/s], (n, 3)."""
+    acceleration: np.ndarray
+    """[m/s^2], (n, 3)."""
+    density: np.ndarray
+    """[kg/m^3], (n,)."""
 
 
 class Simulation(Motion):
@@ -174,6 +201,50 @@ class Simulation(Motion):
             field.from_numpy(whole)
         particles.count[None] = len(identity)
         self._stale = True
+
+    def snapshot(self) -> Snapshot:
+        """A copy of the state; the lists are built anew at the next step.
+
+        A simulation that goes on from the copy builds them too: both then add up in the same order
+        and stay bitwise alike on the CPU.
+        """
+        n = self.particles.count[None]
+        self._stale = True
+        return Snapshot(
+            self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections,
+            self._removed.to_numpy(),
+            *(field.to_numpy()[:n] for field in self._changing()),
+        )  # fmt: skip
+
+    def go_on_from(self, state: Snapshot) -> None:
+        """Go on from a state of the same scene and model.
+
+        Raises:
+            InputError: it is of another number of openings, or there is no room for so many.
+        """
+        n, p = len(state.identity), self.particles
+        if n > p.capacity or state.removed.shape != self._removed.shape:
+            raise InputError(
+                f"a state of {n} particles and {len(state.removed) - 1} openings: the scene has "
+                f"{p.capacity} and {self._removed.shape[0] - 1}"
+            )
+        rows = (state.identity, state.position, state.velocity, state.acceleration, state.density)
+        for field, some in zip(self._changing(), rows, strict=True):
+            whole = field.to_numpy()
+            whole[:n] = some
+            field.from_numpy(whole)
+        p.count[None] = n
+        self._removed.from_numpy(state.removed)
+        self.time, self.last_step, self.fallback_time = (
+            state.time, state.last_step, state.fallback_time
+        )  # fmt: skip
+        self.steps, self.wall_corrections = state.steps, state.wall_corrections
+        self._stale = True
+
+    def _changing(self) -> tuple[ti.Field, ...]:
+        """The fields of a state, in its order."""
+        p = self.particles
+        return p.identity, p.position, p.velocity, p.acceleration, p.density
 
     def before_build(self) -> None:
         """Mark what has left through an opening, or out of the box."""
