@@ -56,7 +56,7 @@ class Checkpoint:
             InputError: it cannot be read, is cut or damaged, or is no checkpoint.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
                 head = json.loads(str(file["head"]))
                 if head["format"] != FORMAT:
                     raise KeyError("format")

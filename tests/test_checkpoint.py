@@ -54,7 +54,7 @@ def whole(box: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path
     for model in ("physics", "implicit", "pcnet"):
         folder = tmp_path_factory.mktemp(model)
         vesselflow(folder, *arguments(box, model, 12))
-        ends[model] = folder / "box.checkpoint.npz"
+        ends[model] = folder / f"{box.name}.checkpoint.npz"
     return ends
 
 
@@ -63,7 +63,7 @@ def test_a_resumed_run_ends_bitwise_like_one_that_was_not_interrupted(
     box: Path, whole: dict[str, Path], tmp_path: Path, model: str
 ) -> None:
     vesselflow(tmp_path, *arguments(box, model, 5))
-    half = tmp_path / "box.checkpoint.npz"
+    half = tmp_path / f"{box.name}.checkpoint.npz"
     assert Checkpoint.read(half).frame == 5
     assert not same(half, whole[model])
     vesselflow(tmp_path, *arguments(box, model, 12), "--resume", half)
@@ -73,7 +73,7 @@ def test_a_resumed_run_ends_bitwise_like_one_that_was_not_interrupted(
 def test_a_run_killed_at_any_moment_goes_on(
     box: Path, whole: dict[str, Path], tmp_path: Path
 ) -> None:
-    kept = tmp_path / "box.checkpoint.npz"
+    kept = tmp_path / f"{box.name}.checkpoint.npz"
     generator = random.Random(1)
     command = [sys.executable, "-m", "app", *arguments(box, "physics", 12)]
     kills = 0
