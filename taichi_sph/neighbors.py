@@ -248,17 +248,18 @@ class Neighbors:
         proxies.cell_start.fill(0)
         if wall.count == 0:
             return
-        x = wall.position.to_numpy()
+        number = np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
+        x = np.asarray(wall.given[0], dtype=number)
         c = np.floor((x - np.asarray(self.grid.lower)) / np.asarray(self.grid.cell)).astype(int)
         c = np.clip(c, 0, np.asarray(self.grid.shape) - 1)
         cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]
         cells = proxies.cell_start.shape[0] - 1
         cell = np.minimum(self.rank.to_numpy()[cell], cells - 1)
         order = np.argsort(cell, kind="stable")
-        for field in (wall.position, wall.normal, wall.volume):
-            field.from_numpy(np.ascontiguousarray(field.to_numpy()[order]))
-        for field, coordinate in zip((proxies.x, proxies.y, proxies.z), x[order].T, strict=True):
-            field.from_numpy(np.pad(coordinate, (0, field.shape[0] - len(coordinate))))
+        # One kernel for all: each field's own would cost some 0.05 s at start.
+        place_proxies(
+            wall, proxies, *(np.ascontiguousarray(a[order], dtype=number) for a in wall.given)
+        )
         start = np.searchsorted(cell[order], np.arange(cells + 1))
         proxies.cell_start.from_numpy(start.astype(np.int32))
 
@@ -287,6 +288,25 @@ class Neighbors:
                     f"{self.support_radius + self.skin:.3g} m, the list holds {capacity}: "
                     "particles have clumped, so the step was too long or the spacing too small"
                 )
+
+
+@ti.kernel
+def place_proxies(
+    w: ti.template(),
+    points: ti.template(),
+    position: ti.types.ndarray(ndim=2),
+    normal: ti.types.ndarray(ndim=2),
+    volume: ti.types.ndarray(ndim=1),
+):
+    """Proxies in the order of the grid.  Writes: the wall's fields, points."""
+    for k in range(volume.shape[0]):
+        for a in ti.static(range(3)):
+            w.position[k][a] = position[k, a]
+            w.normal[k][a] = normal[k, a]
+        w.volume[k] = volume[k]
+        points.x[k] = position[k, 0]
+        points.y[k] = position[k, 1]
+        points.z[k] = position[k, 2]
 
 
 @ti.func

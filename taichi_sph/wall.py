@@ -25,6 +25,8 @@ class Wall:
     """Unit normal out of the lumen, shape (max(count, 1),)."""
     volume: ti.Field
     """V_k of Eq. 3 with gamma = 1 [m^3], shape (max(count, 1),)."""
+    given: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """The same three in the order in which they were given; the lists put them into the fields."""
 
     @classmethod
     def from_numpy(
@@ -41,19 +43,15 @@ class Wall:
         `period` [m] repeats the wall along the axes where it is not zero.
         """
         m = len(position)
-        wall = cls(
+        return cls(
             count=m,
             setback=setback,
             spacing=spacing,
             position=ti.Vector.field(3, float, max(m, 1)),
             normal=ti.Vector.field(3, float, max(m, 1)),
             volume=ti.field(float, max(m, 1)),
+            given=(position, normal, proxy_volumes(position, kernel, period) if m else np.zeros(0)),
         )
-        if m:
-            wall.position.from_numpy(np.asarray(position))
-            wall.normal.from_numpy(np.asarray(normal))
-            wall.volume.from_numpy(proxy_volumes(position, kernel, period))
-        return wall
 
 
 def proxy_volumes(

@@ -144,9 +144,7 @@ class Stage:
     def put_wall(self, position: np.ndarray, normal: np.ndarray) -> None:
         """Replace the proxies (as many) and sort them."""
         volume = proxy_volumes(position, KERNEL, self.period)
-        self.wall.position.from_numpy(position.astype(number()))
-        self.wall.normal.from_numpy(normal.astype(number()))
-        self.wall.volume.from_numpy(volume.astype(number()))
+        self.wall.given = position, normal, volume
         self.neighbors.sort_wall(self.wall)
 
     def build(self) -> None:
