@@ -7,7 +7,7 @@ import io
 import json
 import zipfile
 import zlib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from taichi_sph.simulation import Simulation
 
 FORMAT = "vesselflow checkpoint 1"
-NUMBERS = ("time", "last_step", "fallback_time", "steps", "wall_corrections")
-"""Fields of a state that are no arrays."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +39,12 @@ class Checkpoint:
         Raises:
             OSError: the disk is full, or the folder is gone.
         """
-        state = asdict(self.state)
-        numbers = {name: state.pop(name) for name in NUMBERS}
+        state = vars(self.state)
+        arrays: dict[str, Any] = {k: v for k, v in state.items() if isinstance(v, np.ndarray)}
+        numbers = {name: value for name, value in state.items() if name not in arrays}
         head = {"format": FORMAT, "facts": self.facts, "frame": self.frame, "numbers": numbers}
         content = io.BytesIO()
-        np.savez(content, head=np.array(json.dumps(head)), **state)
+        np.savez(content, head=np.array(json.dumps(head)), **arrays)
         write_bytes(path, content.getvalue())
 
     @classmethod
@@ -60,7 +59,7 @@ class Checkpoint:
                 head = json.loads(str(file["head"]))
                 if head["format"] != FORMAT:
                     raise KeyError("format")
-                arrays = {f.name: file[f.name] for f in fields(Snapshot) if f.name not in NUMBERS}
+                arrays = {name: file[name] for name in file.files if name != "head"}
             state = Snapshot(**head["numbers"], **arrays)
             return cls(head["facts"], head["frame"], state)
         except FileNotFoundError:

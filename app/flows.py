@@ -30,7 +30,7 @@ FAR = 1e6
 """A time that no step reaches [s]: `Motion.step(FAR)` takes the longest stable step."""
 
 SKIN = 0.2
-"""Skin of the lists over the support radius, as in a scene."""
+"""Skin of the lists over the support radius."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.output import check_output, write_json
+from app.output import check_output, require_matplotlib, write_json
 from app.progress import duration
 from taichi_sph.errors import InputError
 
@@ -24,8 +24,7 @@ def check_plot(path: Path | None) -> None:
     """Refuse a picture that cannot be drawn or written; None asks for none."""
     if path is None:
         return
-    if importlib.util.find_spec("matplotlib") is None:
-        raise InputError("--plot: matplotlib is not installed; pip install 'vesselflow[plot]'")
+    require_matplotlib("--plot")
     check_output(path, "--plot", b"\x89PNG")
 
 

@@ -19,16 +19,19 @@ from rich.table import Table
 from taichi_sph.errors import InputError
 
 
+def require_matplotlib(option: str) -> None:
+    """Refuse an option that draws where nothing can."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError(f"{option}: matplotlib is not installed; pip install 'vesselflow[plot]'")
+
+
 def check_plots(folder: Path) -> None:
     """Make a folder for pictures.
 
     Raises:
         InputError: it cannot be made, or nothing can be drawn.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise InputError(
-            f"--plot {folder}: matplotlib is not installed; pip install 'vesselflow[plot]'"
-        )
+    require_matplotlib(f"--plot {folder}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

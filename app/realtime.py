@@ -20,7 +20,7 @@ from nn.weights import Weights
 from taichi_sph.derived import derive, expected_speed
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
-from taichi_sph.vessel import read_vessel
+from taichi_sph.vessel import Vessel, read_vessel
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,9 +54,8 @@ def divided(scene: Scene, particles: int) -> Scene:
     return with_column(varied(scene, None, spacing), particles, None)
 
 
-def steps(scene: Scene, weights: Weights, speed: float) -> tuple[float, float]:
+def steps(scene: Scene, vessel: Vessel, weights: Weights, speed: float) -> tuple[float, float]:
     """Longest step of the physics and of PcNet [s] where blood reaches a speed [m/s]."""
-    vessel = read_vessel(scene)
     factor = (speed / expected_speed(scene, vessel)) ** 2
     gravity = tuple(factor * g for g in scene.gravity)
     d = derive(msgspec.structs.replace(scene, gravity=gravity), vessel, 0, 0)
@@ -100,11 +99,11 @@ def curves(
         InputError: the vessel is too narrow for every size.
     """
     learned = Weights.load(weights)
-    sizes, scenes = [], []
+    sizes, scenes, vessels = [], [], []
     for n in COUNTS:
         each = divided(scene, n)
         try:
-            read_vessel(each)
+            vessels.append(read_vessel(each))
         except InputError:  # too coarse for the narrowest place
             if n == COUNTS[-1]:
                 raise
@@ -112,7 +111,10 @@ def curves(
         sizes.append(n)
         scenes.append(each)
     costs = np.array([cost(each) for each in scenes])
-    longest = np.array([[steps(each, learned, speed) for each in scenes] for speed in SPEEDS])
+    longest = np.array([
+        [steps(*each, learned, speed) for each in zip(scenes, vessels, strict=True)]
+        for speed in SPEEDS
+    ])  # fmt: skip
     return [
         Curve(
             scene.name, model, tuple(sizes), tuple(costs[:, side]), SPEEDS,

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from app import flows
 from app.flows import DENSITY, Liquid, State, state_of
-from app.output import check_plots
+from app.output import check_plots, console
 from taichi_sph import analytic
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.motion import Motion
@@ -625,13 +625,13 @@ def main(
             rows += report.rows
             if plot is not None:
                 files += draw_pictures(report, plot)
-    console = Console()
-    console.print(table_of(rows))
+    terminal = console()
+    terminal.print(table_of(rows))
     missed = sum(not row.passed for row in rows)
-    console.print(
+    terminal.print(
         f"{len(rows) - missed} of {len(rows)} rows within tolerance, "
         f"{time.perf_counter() - begin:.0f} s"
     )
     for file in files:
-        console.print(f"picture {file}", soft_wrap=True)
+        terminal.print(f"picture {file}", soft_wrap=True)
     return 1 if missed else 0

@@ -14,6 +14,7 @@ import taichi as ti
 
 from taichi_sph.errors import RunError
 from taichi_sph.particles import Particles
+from taichi_sph.runtime import number
 from taichi_sph.wall import Wall
 
 ROW_MULTIPLE = 8
@@ -248,8 +249,8 @@ class Neighbors:
         proxies.cell_start.fill(0)
         if wall.count == 0:
             return
-        number = np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
-        x = np.asarray(wall.given[0], dtype=number)
+        given = [np.asarray(a, dtype=number()) for a in wall.given]
+        x = given[0]
         c = np.floor((x - np.asarray(self.grid.lower)) / np.asarray(self.grid.cell)).astype(int)
         c = np.clip(c, 0, np.asarray(self.grid.shape) - 1)
         cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]
@@ -257,9 +258,7 @@ class Neighbors:
         cell = np.minimum(self.rank.to_numpy()[cell], cells - 1)
         order = np.argsort(cell, kind="stable")
         # One kernel for all: each field's own would cost some 0.05 s at start.
-        place_proxies(
-            wall, proxies, *(np.ascontiguousarray(a[order], dtype=number) for a in wall.given)
-        )
+        place_proxies(wall, proxies, *(a[order] for a in given))
         start = np.searchsorted(cell[order], np.arange(cells + 1))
         proxies.cell_start.from_numpy(start.astype(np.int32))
 

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from taichi_sph.errors import RunError
+from taichi_sph.runtime import number
 
 
 @dataclass(eq=False)
@@ -61,9 +62,17 @@ class Particles:
             raise RunError("initial positions and velocities must be finite numbers")
         particles = cls.allocate(n, mass)
         # One kernel for all: each field's own would cost some 0.05 s at start.
-        number = np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
-        place_rows(particles, *(np.ascontiguousarray(a, number) for a in (position, velocity)))
+        place_rows(particles, *(np.ascontiguousarray(a, number()) for a in (position, velocity)))
         return particles
+
+    def replace(self, **rows: np.ndarray) -> None:
+        """Other live rows: fields by name, each (n,) or (n, 3) with the same n <= capacity."""
+        for name, values in rows.items():
+            field = getattr(self, name)
+            whole = field.to_numpy()
+            whole[: len(values)] = values
+            field.from_numpy(whole)
+            self.count[None] = len(values)
 
     def in_order(self, field: ti.Field) -> np.ndarray:
         """Copy of a field's live rows, sorted by identity."""

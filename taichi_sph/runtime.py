@@ -3,12 +3,18 @@
 import contextlib
 import os
 
+import numpy as np
 import taichi as ti
 
 from taichi_sph.errors import InputError
 
 ARCHITECTURES = ("cpu", "gpu")
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+
+
+def number() -> type[np.floating]:
+    """The numpy type of a kernel's `float`."""
+    return np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
 
 
 def _threads() -> set[int]:

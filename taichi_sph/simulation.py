@@ -190,16 +190,7 @@ class Simulation(Motion):
 
     def put(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
         """Replace the blood: identities (n,), positions [m] and velocities [m/s], (n, 3)."""
-        particles = self.particles
-        for field, rows in (
-            (particles.identity, identity),
-            (particles.position, position),
-            (particles.velocity, velocity),
-        ):
-            whole = field.to_numpy()
-            whole[: len(rows)] = rows
-            field.from_numpy(whole)
-        particles.count[None] = len(identity)
+        self.particles.replace(identity=identity, position=position, velocity=velocity)
         self._stale = True
 
     def snapshot(self) -> Snapshot:
@@ -208,12 +199,15 @@ class Simulation(Motion):
         A simulation that goes on from the copy builds them too: both then add up in the same order
         and stay bitwise alike on the CPU.
         """
-        n = self.particles.count[None]
+        p, n = self.particles, self.particles.count[None]
         self._stale = True
         return Snapshot(
             self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections,
             self._removed.to_numpy(),
-            *(field.to_numpy()[:n] for field in self._changing()),
+            *(
+                field.to_numpy()[:n]
+                for field in (p.identity, p.position, p.velocity, p.acceleration, p.density)
+            ),
         )  # fmt: skip
 
     def go_on_from(self, state: Snapshot) -> None:
@@ -228,23 +222,19 @@ class Simulation(Motion):
                 f"a state of {n} particles and {len(state.removed) - 1} openings: the scene has "
                 f"{p.capacity} and {self._removed.shape[0] - 1}"
             )
-        rows = (state.identity, state.position, state.velocity, state.acceleration, state.density)
-        for field, some in zip(self._changing(), rows, strict=True):
-            whole = field.to_numpy()
-            whole[:n] = some
-            field.from_numpy(whole)
-        p.count[None] = n
+        p.replace(
+            identity=state.identity,
+            position=state.position,
+            velocity=state.velocity,
+            acceleration=state.acceleration,
+            density=state.density,
+        )
         self._removed.from_numpy(state.removed)
         self.time, self.last_step, self.fallback_time = (
             state.time, state.last_step, state.fallback_time
         )  # fmt: skip
         self.steps, self.wall_corrections = state.steps, state.wall_corrections
         self._stale = True
-
-    def _changing(self) -> tuple[ti.Field, ...]:
-        """The fields of a state, in its order."""
-        p = self.particles
-        return p.identity, p.position, p.velocity, p.acceleration, p.density
 
     def before_build(self) -> None:
         """Mark what has left through an opening, or out of the box."""

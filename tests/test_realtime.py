@@ -32,10 +32,11 @@ def test_steps_are_as_long_as_the_speed_lets_them():
     scene = realtime.divided(scene, 4000)
     assert scene.column.particles == 4000
     assert scene.discretization.spacing == pytest.approx(whole * 4 ** (1 / 3), rel=1e-9)
-    own = expected_speed(scene, read_vessel(scene))
+    vessel = read_vessel(scene)
+    own = expected_speed(scene, vessel)
     radius = 2.0 * scene.discretization.spacing
     for speed in (0.5, own):
-        physics, pcnet = realtime.steps(scene, weights, speed)
+        physics, pcnet = realtime.steps(scene, vessel, weights, speed)
         # C h_s/(c + v) with c = 10 v, and the trained C R/c
         assert physics == pytest.approx(0.4 * 0.5 * radius / (11.0 * speed), rel=1e-6)
         courant = weights.training.courant_number
