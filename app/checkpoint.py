@@ -96,9 +96,18 @@ class Checkpointer:
         self.path, self.every, self.facts = path, every, facts
 
     def on_frame(self, simulation: "Simulation", frame: int, figures: "Diagnostics") -> None:
-        """Write one if it is time."""
+        """Write one if it is time.
+
+        Raises:
+            OSError: it cannot be written; the one before is still there.
+        """
         if frame % self.every == 0:
-            Checkpoint(self.facts, frame, simulation.snapshot()).write(self.path)
+            try:
+                Checkpoint(self.facts, frame, simulation.snapshot()).write(self.path)
+            except OSError as error:
+                raise OSError(
+                    f"{self.path}: the checkpoint cannot be written: {error.strerror}"
+                ) from None
 
     def close(self, ending: str) -> None:
         """Nothing: the last checkpoint stays."""

@@ -5,11 +5,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from app.checkpoint import Checkpoint
+from app.checkpoint import Checkpoint, Checkpointer
 from taichi_sph.errors import InputError
 
 ARRAYS = ("identity", "position", "velocity", "acceleration", "density", "removed")
@@ -144,3 +146,12 @@ def test_a_recording_of_the_run_so_far_is_not_replaced(
     command = [*arguments(box, "physics", 13), "--resume", whole["physics"], "--rrd", recording]
     assert "holds the run so far" in vesselflow(tmp_path, *command, code=2)
     assert recording.read_bytes() == b"RRF2...."
+
+
+def test_a_checkpoint_that_cannot_be_written_is_named(whole: dict[str, Path]) -> None:
+    kept = Checkpoint.read(whole["physics"])
+    simulation: Any = SimpleNamespace(snapshot=lambda: kept.state)
+    figures: Any = None
+    writer = Checkpointer(Path("/no/such/folder/a.npz"), 1, kept.facts)
+    with pytest.raises(OSError, match=r"^/no/such/folder/a.npz: the checkpoint cannot be written"):
+        writer.on_frame(simulation, 3, figures)
