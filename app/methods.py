@@ -116,6 +116,11 @@ class Stretched:
         """As the model's."""
         return self.model.fell_back
 
+    @property
+    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
+        """As the model's."""
+        return self.model.pairwise
+
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """The model's step times the factor [s]."""
         return self.factor * self.model.stable_step(largest_speed, largest_acceleration)
@@ -126,6 +131,7 @@ class Ballistic:
 
     name = "ballistic"
     fell_back = False
+    pairwise = None
 
     def __init__(self, fluid: Fluid, capacity: int):
         """It keeps nothing but the liquid."""

@@ -83,7 +83,7 @@ def with_column(scene: Scene, particles: int | None, height: float | None) -> Sc
         return scene
     if particles is not None and height is not None:
         raise InputError("--particles and --height: give one of the two")
-    column = msgspec.structs.replace(scene.column, particles=particles, height=height)
+    column = msgspec.structs.replace(scene.column, particles=particles, height=height, full=False)
     return msgspec.structs.replace(scene, column=column)
 
 

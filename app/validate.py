@@ -1,5 +1,6 @@
 """`vesselflow validate`: the physics against theory, one table, each row with its tolerance."""
 
+import cmath
 import math
 import sys
 import time
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from app import flows
+from app import flows, operations
 from app.flows import DENSITY, Liquid, State, state_of
 from app.output import check_plots, console
 from taichi_sph import analytic
@@ -121,11 +122,21 @@ def relative_l2(computed: np.ndarray, theory: np.ndarray) -> float:
 
 
 def watched(
-    motion: Motion, times: list[float], report: Report, begin: float, end: float
+    motion: Motion,
+    times: list[float],
+    report: Report,
+    begin: float,
+    end: float,
+    axial_force: Callable[[float], float] | None = None,
 ) -> Iterator[int]:
-    """Advance to each time, telling progress between two fractions; yields the index."""
+    """Advance to each time, telling progress between two fractions; yields the index.
+
+    A force per mass along z [m/s^2] that changes with time [s] is set before each step.
+    """
     for k, target in enumerate(times):
         while motion.time < target * (1.0 - 1e-12):
+            if axial_force is not None:
+                motion.gravity = (0.0, 0.0, axial_force(motion.time))
             motion.step(target - motion.time)
             if motion.steps % 50 == 0:
                 report.advance(begin + (end - begin) * motion.time / times[-1])
@@ -302,6 +313,89 @@ def poiseuille(report: Report, quick: bool) -> None:
     report.add(
         "Poiseuille: order of convergence (error: 1 - order)",
         f"{order:.2f}", "1", max(0.0, 1.0 - order), 0.5,
+    )  # fmt: skip
+
+
+WOMERSLEY = 4.0
+"""Of an artery 5.4 mm across at 70 beats a minute."""
+PULSES = 4
+"""Periods from rest; what is left of the start is then below 0.1 %."""
+PHASES = 40
+"""Samples of a period; eight of them are held against the profile."""
+
+
+def harmonic(time: np.ndarray, values: np.ndarray, frequency: float) -> complex:
+    """Return the complex amplitude A of Re{A e^(i w t)} + constant by least squares."""
+    turn = frequency * time
+    basis = np.column_stack([np.cos(turn), -np.sin(turn), np.ones_like(turn)])
+    real, imaginary, _ = np.linalg.lstsq(basis, values, rcond=None)[0]
+    return complex(real, imaginary)
+
+
+def womersley(report: Report, quick: bool) -> None:
+    """Pulsating flow in a round tube, from rest: amplitude and phase, and the profile."""
+    across, tolerance = (10, 0.1) if quick else (20, 0.05)
+    nu = VISCOSITY / DENSITY
+    speed = REYNOLDS * nu / (2.0 * RADIUS)
+    frequency = nu * (WOMERSLEY / RADIUS) ** 2
+    period = 2.0 * math.pi / frequency
+    constants = (frequency, VISCOSITY, DENSITY)
+    line = np.linspace(0.0, RADIUS, 200)
+
+    # Everything is proportional to the drive: the one that makes the largest speed U.
+    in_phase, behind = (
+        analytic.pipe_pulsation(line, time, RADIUS, 1.0, *constants) for time in (0.0, period / 4.0)
+    )
+    drive = speed / float(np.hypot(in_phase, behind).max())
+
+    def theory(r: np.ndarray, time: float) -> np.ndarray:
+        return analytic.pipe_pulsation(r, time, RADIUS, drive, *constants)
+
+    def force(time: float) -> float:
+        return drive / DENSITY * math.cos(frequency * time)
+
+    liquid = Liquid(
+        Newtonian(VISCOSITY), MACH * speed, 2.0 * RADIUS / across,
+        background_pressure=BACKGROUND * DENSITY * speed**2,
+    )  # fmt: skip
+    motion = flows.tube(liquid, RADIUS, drive)
+    times = [(PULSES - 2 + (k + 1) / PHASES) * period for k in range(2 * PHASES)]
+    means, computed, expected = [], [], []
+    for k in watched(motion, times, report, 0.0, 1.0, force):
+        r, u = axial(state_of(motion))
+        means.append(float(u.mean()))
+        sample = k + 1 - PHASES  # of the last period
+        if sample > 0 and sample % (PHASES // 8) == 0:
+            computed.append(u)
+            expected.append(theory(r, times[k]))
+        if sample > 0 and sample % (PHASES // 4) == 0:
+            report.draw(
+                "womersley", "r/R", "u/U",
+                Curve(f"t = {sample / PHASES:g} T", r / RADIUS, u / speed,
+                      line / RADIUS, theory(line, times[k]) / speed),
+            )  # fmt: skip
+    flow = math.pi * RADIUS**2 * np.array(means)
+    before, found = (
+        harmonic(np.array(times)[part], flow[part], frequency)
+        for part in (slice(PHASES), slice(PHASES, None))
+    )
+    exact = analytic.pipe_pulsation_flow_rate(RADIUS, drive, *constants)
+    where = f"Womersley, Wo {WOMERSLEY:g}, {across} across"
+    report.compare(
+        f"{where}: amplitude of the flow rate (still changing {abs(found / before - 1.0):.1%})",
+        abs(found) * 1e9, abs(exact) * 1e9, tolerance, "mm^3/s",
+    )  # fmt: skip
+    lag, lag_exact = -cmath.phase(found), -cmath.phase(exact)
+    report.add(
+        f"{where}: lag of the flow rate behind the force (error: radians)",
+        f"{lag:.4f} rad", f"{lag_exact:.4f} rad", abs(lag - lag_exact), tolerance,
+    )  # fmt: skip
+    u, v = np.concatenate(computed), np.concatenate(expected)
+    report.add(
+        f"{where}: speed at 8 phases, L2 over particles",
+        f"rms {math.sqrt(np.square(u).mean()) / speed:.4f} U",
+        f"{math.sqrt(np.square(v).mean()) / speed:.4f} U",
+        relative_l2(u, v), tolerance,
     )  # fmt: skip
 
 
@@ -515,8 +609,12 @@ CASES = (
     Case("taylor_green", "Taylor-Green vortices", "f32", taylor_green),
     Case("hydrostatic", "hydrostatic column", "f32", hydrostatic),
     Case("poiseuille", "Poiseuille flow in a tube", "f32", poiseuille),
+    Case("womersley", "Womersley flow in a tube", "f32", womersley),
     Case("casson", "Casson blood in a tube", "f32", casson),
     Case("dam_break", "dam break", "f32", dam_break),
+    Case("account", "pump and reservoir", "f32", operations.account),
+    Case("wound", "bleeding from a wound", "f32", operations.wound),
+    Case("tool", "sphere in a tank", "f32", operations.tool),
 )
 
 

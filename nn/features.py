@@ -32,6 +32,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from taichi_sph.wall import wall_velocity
+
 COUNT = 23
 EXTENDED = 25
 """With two more, for density is not among the paper's: 50 max(rho/rho_0 - 1, 0) and T div v."""
@@ -225,6 +227,7 @@ def features_of(
 
     behind = 0.0
     wall_gradient = ti.Vector([0.0, 0.0, 0.0])
+    wall_rate = 0.0
     m = 0.0
     wall_sum = ti.Vector([0.0, 0.0, 0.0])
     wall_distance = ti.Vector([0.0, 0.0])
@@ -238,6 +241,9 @@ def features_of(
             r = q * ti.static(scales.support_radius)
             behind += w.volume[kk] * fluid.kernel.w(r)
             wall_gradient += (w.volume[kk] * fluid.kernel.slope(r)) * r_ki
+            if ti.static(w.moves):
+                slope = w.volume[kk] * fluid.kernel.slope(r)
+                wall_rate += slope * wall_velocity(w, kk).dot(r_ki)
             if ti.static(inputs.among(17, 18, 19)):
                 wall_sum += r_ki
             if ti.static(inputs.among(20)):
@@ -260,7 +266,8 @@ def features_of(
     gamma = ti.static(fluid.calibration.wall_density)
     f[25] = share * blood + gamma * behind
     f[23] = 50.0 * ti.max(0.0, f[25] - 1.0)
-    rate = share * blood_rate * ti.static(scales.speed) - gamma * v_i.dot(wall_gradient)
+    rate = share * blood_rate * ti.static(scales.speed)
+    rate += gamma * (wall_rate - v_i.dot(wall_gradient))
     f[24] = -rate * ti.static(scales.support_radius * scales.frame_interval)
     one_sided = share * gradient + gamma * wall_gradient
     f[26] = ti.static(scales.support_radius**4) * (one_sided.norm_sqr() + share**2 * gradient2)

@@ -175,6 +175,11 @@ class DirectPcNet:
         self.fell_back = False
         self.next_acceleration = ti.Vector.field(3, float, capacity)
 
+    @property
+    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
+        """Forces come from pairs only where the physics took over."""
+        return self.physics.pairwise if self.fell_back else None
+
     def accelerate(
         self,
         particles: Particles,

@@ -18,7 +18,7 @@ from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
 from taichi_sph.rheology import Rheology
 from taichi_sph.smoothing_kernels import WendlandC2
-from taichi_sph.wall import Wall
+from taichi_sph.wall import Wall, wall_velocity
 
 
 class AccelerationModel(Protocol):
@@ -30,6 +30,11 @@ class AccelerationModel(Protocol):
     @property
     def fell_back(self) -> bool:
         """Whether the last acceleration is the physics', since the model did not trust itself."""
+        ...
+
+    @property
+    def pairwise(self) -> "tuple[Fluid, ti.Field, ti.Field] | None":
+        """What the last forces were summed from: constants, p/rho^2 and mu; None if from none."""
         ...
 
     def accelerate(
@@ -94,6 +99,11 @@ class SphAcceleration:
         self.stress = ti.Matrix.field(3, 3, float, capacity if fluid.nested else 1)
         """tau [Pa], in the nested form only."""
 
+    @property
+    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field]:
+        """Constants, p/rho^2 and mu."""
+        return self.fluid, self.pressure_term, self.viscosity
+
     def accelerate(
         self,
         particles: Particles,
@@ -145,7 +155,7 @@ def sum_density(
     Also p_i/rho_i^2 (Eq. 14) and, where blood is not Newtonian, mu(|shear rate|) from
     (Eqs. 7, 8, 10)
 
-        L_i = sum_j V (v_j - v_i) grad W_ij + gamma' sum_k V_k (0 - v_i) grad W_ik
+        L_i = sum_j V (v_j - v_i) grad W_ij + gamma' sum_k V_k (v_k - v_i) grad W_ik
 
     with the rest volume V = m/rho_0 for m/rho_j: equal to within the compression, and known in
     the same pass.  Reads: position, velocity.  Writes: density, pressure_term, viscosity.
@@ -173,7 +183,10 @@ def sum_density(
             behind += w.volume[k] * fluid.kernel.w(r)
             if ti.static(fluid.rheology.shear_dependent and not fluid.nested):
                 factor = ti.static(fluid.calibration.gradient * fluid.calibration.wall_gradient)
-                gradient -= (factor * w.volume[k] * fluid.kernel.slope(r) * v_i).outer_product(r_ik)
+                v_ik = v_i - wall_velocity(w, k)
+                gradient -= (factor * w.volume[k] * fluid.kernel.slope(r) * v_ik).outer_product(
+                    r_ik
+                )
         rho = mass * blood + ti.static(fluid.calibration.wall_density * rest_density) * behind
         p.density[i] = rho
         pressure_term[i] = fluid.state.pressure(rho) / (rho * rho)
@@ -190,6 +203,28 @@ def shear_rate(gradient):
         entry = g[a, b] - (third if ti.static(a == b) else 0.0)
         square += entry * entry
     return ti.sqrt(0.5 * square)
+
+
+@ti.kernel
+def force_on_tool(
+    p: ti.template(),
+    w: ti.template(),
+    nb: ti.template(),
+    fluid: ti.template(),
+    pressure_term: ti.template(),
+    viscosity: ti.template(),
+) -> ti.math.vec3:
+    """F = -m sum_i sum_k a_ik over the proxies of the tool [N], a_ik as in `sum_acceleration`."""
+    force = ti.Vector([0.0, 0.0, 0.0])
+    for i in range(p.count[None]):
+        for n in range(nb.wall_count[i]):
+            k = nb.wall_index[i, n]
+            if k >= w.count:
+                r_ik = nb.grid.separation(p.position[i], w.position[k])
+                force -= from_proxy(
+                    w, k, r_ik, p.velocity[i], p.density[i], pressure_term[i], viscosity[i], fluid
+                )
+    return ti.static(fluid.calibration.mass * fluid.state.rest_density) * force
 
 
 @ti.kernel
@@ -218,7 +253,8 @@ def sum_stress(
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
             slope = fluid.kernel.slope(r_ik.norm()) * ti.static(fluid.calibration.wall_gradient)
-            gradient -= (w.volume[k] * slope * v_i).outer_product(r_ik)
+            v_ik = v_i - wall_velocity(w, k)
+            gradient -= (w.volume[k] * slope * v_ik).outer_product(r_ik)
         gradient *= ti.static(fluid.calibration.gradient)
         viscosity[i] = fluid.rheology.viscosity(shear_rate(gradient))
         g = gradient + gradient.transpose()
@@ -226,6 +262,21 @@ def sum_stress(
         for a in ti.static(range(3)):
             g[a, a] -= third
         stress[i] = viscosity[i] * g
+
+
+@ti.func
+def from_proxy(w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, fluid: ti.template()):
+    """a_ik/rho_0 [m^4/(kg s^2)]: see `sum_acceleration`."""
+    eps = ti.static(fluid.softening)
+    r2 = r_ik.norm_sqr()
+    slope = fluid.kernel.slope(ti.sqrt(r2))
+    v_ik = v_i - wall_velocity(w, k)
+    push = ti.static(fluid.calibration.gradient) * p_i
+    if ti.static(fluid.artificial_viscosity > 0.0):
+        push -= ti.static(fluid.signal) * ti.min(0.0, v_ik.dot(r_ik)) / ((r2 + eps) * rho_i)
+    a_ik = -(ti.static(fluid.calibration.wall_density) * w.volume[k] * push * slope) * r_ik
+    friction = ti.static(2.0 * fluid.calibration.wall_friction) * mu_i / (rho_i * rho_i)
+    return a_ik + (w.volume[k] * friction * slope * r2 / (r2 + eps)) * v_ik
 
 
 @ti.kernel
@@ -247,9 +298,9 @@ def sum_acceleration(
         a_ij = -m (p_i/rho_i^2 + p_j/rho_j^2 + Pi_ij) grad W_ij
                + m 2 mu_ij/(rho_i rho_j) (r_ij . grad W_ij)/(r_ij^2 + eps) v_ij
     Wall, Eq. 15 with one p_i/rho_i^2 (see calibration), and Eq. 16's friction in the same form as
-    between blood, mu_k = mu_i, rho_k = rho_i, v_k = 0:
+    between blood, mu_k = mu_i, rho_k = rho_i:
         a_ik = -gamma rho_0 V_k (p_i/rho_i^2 + Pi_ik) grad W_ik
-               + gamma_mu rho_0 V_k 2 mu_i/rho_i^2 (r_ik . grad W_ik)/(r_ik^2 + eps) v_i
+               + gamma_mu rho_0 V_k 2 mu_i/rho_i^2 (r_ik . grad W_ik)/(r_ik^2 + eps) v_ik
     (Eq. 16 takes the part of v along r_ik: at a wall that lies to one side it would damp motion
     towards the wall some ten times harder than motion along it.)
     Both pressure forces carry the gradient's calibration.  mu_ij is the harmonic mean;
@@ -291,14 +342,7 @@ def sum_acceleration(
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
-            r2 = r_ik.norm_sqr()
-            slope = fluid.kernel.slope(ti.sqrt(r2))
-            push = ti.static(fluid.calibration.gradient) * p_i
-            if ti.static(fluid.artificial_viscosity > 0.0):
-                push -= ti.static(fluid.signal) * ti.min(0.0, v_i.dot(r_ik)) / ((r2 + eps) * rho_i)
-            wall -= (ti.static(fluid.calibration.wall_density) * w.volume[k] * push * slope) * r_ik
-            friction = ti.static(2.0 * fluid.calibration.wall_friction) * mu_i / (rho_i * rho_i)
-            wall += (w.volume[k] * friction * slope * r2 / (r2 + eps)) * v_i
+            wall += from_proxy(w, k, r_ik, v_i, rho_i, p_i, mu_i, fluid)
         wall *= ti.static(fluid.state.rest_density)
         # A vector as an argument would cost 0.05 ms a launch.
         p.acceleration[i] = a_i + wall + ti.Vector([g_x, g_y, g_z])

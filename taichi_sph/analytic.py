@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
-from scipy.special import j0, j1, jn_zeros
+from scipy.special import j0, j1, jn_zeros, jv
 
 BESSEL_TERMS = 200
 """Terms of the start-up series; the first one left out is below 1e-6 of the steady speed."""
@@ -44,6 +44,43 @@ def pipe_start_up(
     decay = np.exp(-(zeros**2) * viscosity / density * time / radius**2)
     series = j0(np.multiply.outer(np.asarray(r) / radius, zeros)) @ (decay / (zeros**3 * j1(zeros)))
     return pipe_speed(r, radius, drive, viscosity) - 2.0 * drive * radius**2 / viscosity * series
+
+
+def womersley_number(radius: float, frequency: float, viscosity: float, density: float) -> float:
+    """Return Wo = R sqrt(w rho/mu) [-] at an angular frequency w [1/s]: radius over layer depth."""
+    return radius * math.sqrt(frequency * density / viscosity)
+
+
+def pipe_pulsation(
+    r: np.ndarray,
+    time: float,
+    radius: float,
+    drive: float,
+    frequency: float,
+    viscosity: float,
+    density: float,
+) -> np.ndarray:
+    """Speed in a round pipe that G cos(w t) has driven for long [m/s].
+
+    u = Re{G/(i rho w) [1 - J0(i^(3/2) Wo r/R)/J0(i^(3/2) Wo)] e^(i w t)}, w the angular `frequency`
+    [1/s]: Womersley (1955), doi:10.1113/jphysiol.1955.sp005276.
+    """
+    edge = (1j**1.5) * womersley_number(radius, frequency, viscosity, density)
+    shape = 1.0 - jv(0, edge * np.asarray(r) / radius) / jv(0, edge)
+    turn = np.exp(1j * frequency * time)
+    return np.real(drive / (1j * density * frequency) * shape * turn)
+
+
+def pipe_pulsation_flow_rate(
+    radius: float, drive: float, frequency: float, viscosity: float, density: float
+) -> complex:
+    """Flow rate of the same as a complex number Q, Re{Q e^(i w t)} [m^3/s].
+
+    Q = pi R^2 G/(i rho w) [1 - 2 J1(i^(3/2) Wo)/(i^(3/2) Wo J0(i^(3/2) Wo))].
+    """
+    edge = (1j**1.5) * womersley_number(radius, frequency, viscosity, density)
+    shape = 1.0 - 2.0 * jv(1, edge) / (edge * jv(0, edge))
+    return complex(math.pi * radius**2 * drive / (1j * density * frequency) * shape)
 
 
 def channel_start_up(

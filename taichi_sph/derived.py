@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from taichi_sph.rheology import rheology_of
 from taichi_sph.scene import Scene
 from taichi_sph.vessel import Vessel
+from taichi_sph.waveform import read_waveform
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class Derived:
     support_radius: float
     """R [m]."""
     expected_speed: float
-    """Speed of a free fall through the whole lumen, along gravity [m/s]."""
+    """See the function of that name [m/s]."""
     sound_speed: float
     """c [m/s]: the scene's ratio times the expected speed."""
     step: float
@@ -31,13 +33,28 @@ class Derived:
 
 
 def expected_speed(scene: Scene, vessel: Vessel) -> float:
-    """sqrt(2 g H), H the extent of the lumen along gravity [m/s]."""
+    """Largest speed that the scene's drive can give blood [m/s].
+
+    Of a free fall through the whole lumen and, where openings are driven, of a jet into the open
+    under the highest pressure, sqrt(2 (g H + p/rho)), or of a parabolic profile of all that flows,
+    2 Q/A, in the narrowest place, whichever is more.
+    """
     gravity = np.asarray(scene.gravity)
     g = float(np.linalg.norm(gravity))
-    if g == 0.0:
-        return 0.0
-    along = vessel.vertices @ (gravity / g)
-    return math.sqrt(2.0 * g * float(along.max() - along.min()))
+    head = 0.0
+    if g > 0.0:
+        along = vessel.vertices @ (gravity / g)
+        head = g * float(along.max() - along.min())
+    pressure = flow = 0.0
+    for table in scene.openings.values():
+        if table.driven:
+            wave = read_waveform(table.waveform, Path(scene.folder)).factor
+            pressure = max(pressure, float((wave * (table.pressure or 0.0)).max()))
+            flow += float(np.abs(wave * (table.flow or 0.0)).max())
+    jet = math.sqrt(2.0 * (head + pressure / scene.blood.density))
+    if flow > 0.0:
+        return max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
+    return jet
 
 
 def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> Derived:

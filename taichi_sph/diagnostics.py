@@ -37,6 +37,12 @@ class Diagnostics:
     """Largest speed [m/s]."""
     fallback_share: float
     """Part of the simulated time in which the model fell back to the physics."""
+    added_volume: float = 0.0
+    """Volume that pistons have added [m^3]."""
+    bled_volume: float = 0.0
+    """Volume that has left through wounds [m^3]."""
+    sucked_volume: float = 0.0
+    """Volume that suction has taken [m^3]."""
 
 
 def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]:
@@ -48,7 +54,13 @@ def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]
 
 
 def diagnose(
-    simulation: Any, density: np.ndarray, drained: dict[str, int], leaks: int
+    simulation: Any,
+    density: np.ndarray,
+    drained: dict[str, int],
+    leaks: int,
+    added: int = 0,
+    bled: int = 0,
+    sucked: int = 0,
 ) -> Diagnostics:
     """Figures of a simulation, ours or one that is read as ours is.
 
@@ -57,7 +69,11 @@ def diagnose(
         density: of the live blood [kg/m^3], (n,).
         drained: particles that have left, by opening.
         leaks: particles outside the lumen that no opening explains.
+        added: particles that pistons have added.
+        bled: particles that have left through wounds.
+        sucked: particles that suction has taken.
     """
+    volume = simulation.particles.mass / simulation.scene.blood.density
     rest_density = simulation.scene.blood.density
     velocity = simulation.velocities().astype(np.float64)
     p99, largest = compression(density, rest_density) if simulation.steps else (0.0, 0.0)
@@ -67,7 +83,10 @@ def diagnose(
         step=simulation.last_step,
         particles=len(velocity),
         drained=drained,
-        drained_volume=sum(drained.values()) * simulation.particles.mass / rest_density,
+        drained_volume=sum(drained.values()) * volume,
+        added_volume=added * volume,
+        bled_volume=bled * volume,
+        sucked_volume=sucked * volume,
         leaks=leaks,
         wall_corrections=simulation.wall_corrections,
         compression_p99=p99,

@@ -161,7 +161,13 @@ def fill_column(lumen: Lumen, opening: Opening, column: Column, spacing: float) 
             f"column.particles: {column.particles} do not fit behind opening "
             f"{opening.name!r} at spacing {spacing:g} m; {count} fit"
         )
-    assert column.height is not None
+    if column.height is None:
+        if count == 0:
+            raise InputError(
+                f"column.full: nothing fits behind opening {opening.name!r} at spacing "
+                f"{spacing:g} m"
+            )
+        return points[grid][::-1].copy()
     if column.height < (1.0 - _TOLERANCE) * spacing:
         raise InputError(
             f"column.height: {column.height:g} m is less than one layer of particles at spacing "

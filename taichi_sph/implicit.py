@@ -25,7 +25,7 @@ from taichi_sph.acceleration import Fluid, SphAcceleration, shear_rate, sum_acce
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
 from taichi_sph.scene import Scene
-from taichi_sph.wall import Wall
+from taichi_sph.wall import Wall, wall_velocity
 
 STIFFNESS = 1.0
 """k of the first guess."""
@@ -66,6 +66,11 @@ class ImplicitAcceleration:
         self.physics = SphAcceleration(fluid, capacity)
         self.response = ti.field(float, capacity)
         """T^2 rho_0 D [kg s^2/m^5]."""
+
+    @property
+    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field]:
+        """Constants, p/rho^2 and mu."""
+        return self.fluid, self.physics.pressure_term, self.physics.viscosity
 
     def guess(self, particles: Particles, wall: Wall, neighbors: Neighbors) -> None:
         """Density, first pressure, viscosity and response of each particle."""
@@ -151,6 +156,7 @@ def guess_pressure(
         gradient *= ti.static(fluid.calibration.gradient) * share
         behind = 0.0
         wall_g = ti.Vector([0.0, 0.0, 0.0])
+        wall_gradient = ti.Matrix.zero(float, 3, 3)
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
@@ -158,12 +164,15 @@ def guess_pressure(
             slope = fluid.kernel.slope(r) * w.volume[k]
             behind += w.volume[k] * fluid.kernel.w(r)
             wall_g += slope * r_ik
+            if ti.static(w.moves):
+                wall_gradient += (slope * wall_velocity(w, k)).outer_product(r_ik)
+        wall_gradient -= v_i.outer_product(wall_g)
         if ti.static(fluid.rheology.shear_dependent):
             factor = ti.static(fluid.calibration.gradient * fluid.calibration.wall_gradient)
-            gradient -= factor * v_i.outer_product(wall_g)
+            gradient += factor * wall_gradient
         ratio = share * blood + gamma * behind
         # d(rho/rho_0)/dt
-        rate = share * rate + gamma * v_i.dot(wall_g)
+        rate = share * rate - gamma * wall_gradient.trace()
         one_sided = share * sum_g + gamma * wall_g
         d = one_sided.norm_sqr() + share * share * sum_g2
         least = ti.static(LEAST_RESPONSE / fluid.kernel.support_radius**2)
@@ -204,7 +213,8 @@ def correct_pressure(
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
-            behind += w.volume[k] * fluid.kernel.slope(r_ik.norm()) * v_i.dot(r_ik)
+            v_ik = v_i - wall_velocity(w, k)
+            behind += w.volume[k] * fluid.kernel.slope(r_ik.norm()) * v_ik.dot(r_ik)
         after = p.density[i] / rest_density - 1.0 + interval * (share * rate + gamma * behind)
         pressure_term[i] = ti.max(
             0.0, pressure_term[i] + ti.static(RELAXATION) * after / response[i]

@@ -2,12 +2,24 @@
 
 import taichi as ti
 
+from taichi_sph.pistons import Gates
+from taichi_sph.wall import wall_velocity
+
 WALL_MARGIN = 0.1
 """Blood may come this close to the lumen surface [setbacks]; at rest it keeps some 0.5."""
 
 WALL_SIDE = 0.5
 """A proxy guards only blood that was on its side before the step, to this depth [setbacks]:
 behind a thin septum lies another branch, whose blood must not be pulled over."""
+
+
+class NoPlugs:
+    """Nothing drives blood."""
+
+    gates = Gates()
+
+
+NO_PLUGS = NoPlugs()
 
 
 @ti.func
@@ -39,7 +51,12 @@ def survey(p: ti.template()) -> ti.math.vec3:
 
 @ti.kernel
 def kick_drift(
-    p: ti.template(), w: ti.template(), nb: ti.template(), printed: ti.template(), dt: float
+    p: ti.template(),
+    w: ti.template(),
+    nb: ti.template(),
+    plugs: ti.template(),
+    printed: ti.template(),
+    dt: float,
 ) -> ti.math.vec2:
     """Advance velocity and position by dt [s], then keep blood inside the wall.
 
@@ -49,7 +66,8 @@ def kick_drift(
     The wall's last defence: blood that comes nearer to the lumen surface than WALL_MARGIN
     setbacks is put back on that distance along the normal of the proxies beside it, and its
     velocity into the wall is taken away.  The pressure of the wall holds blood that is packed;
-    this holds a lone drop, which has no pressure.
+    this holds a lone drop, which has no pressure.  Blood of a plug moves with it, and no wall stops
+    it (see `taichi_sph.pistons`).
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.
@@ -65,12 +83,19 @@ def kick_drift(
             x += 0.5 * (v + v_new) * dt
         else:
             x += v_new * dt
+        walls = nb.wall_count[i]
+        if ti.static(plugs.gates.count > 0):
+            plug = plugs.gates.plug_of(x_old)
+            if plug >= 0:
+                v_new = plugs.speed[plug] * plugs.gates.way_in(plug)
+                x = x_old + v_new * dt
+                walls = 0
         near2 = ti.static((0.75 * w.spacing) ** 2)
         aside2 = ti.static((1.1 * w.spacing) ** 2)
         limit = ti.static(-(1.0 + WALL_MARGIN) * w.setback)
         side = ti.static(-(1.0 - WALL_SIDE) * w.setback)
         touched = 0
-        for n in range(nb.wall_count[i]):
+        for n in range(walls):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x, w.position[k])
             normal = w.normal[k]
@@ -84,7 +109,7 @@ def kick_drift(
             )
             if beyond and before < side:
                 x -= (depth - limit) * normal
-                v_new -= ti.max(0.0, v_new.dot(normal)) * normal
+                v_new -= ti.max(0.0, (v_new - wall_velocity(w, k)).dot(normal)) * normal
                 touched = 1
         corrected += ti.cast(touched, float)
         p.velocity[i] = v_new

@@ -1,14 +1,16 @@
 """Motion: particles, wall and lists in a box, and the step that every model shares."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from taichi_sph.acceleration import AccelerationModel
 from taichi_sph.errors import RunError
-from taichi_sph.integrator import kick_drift, survey
+from taichi_sph.integrator import NO_PLUGS, NoPlugs, kick_drift, survey
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
+from taichi_sph.pistons import Pistons
 from taichi_sph.wall import Wall
 
 
@@ -44,6 +46,10 @@ class Motion:
         """Simulated time for which the model fell back to the physics [s]."""
         self.step_limit = math.inf
         """Longest step allowed beside the model's own limit [s]."""
+        self.plugs: Pistons | NoPlugs = NO_PLUGS
+        """What drives blood through openings."""
+        self._wall_moved = 0.0
+        """How far a proxy may have moved since the lists were built [m]."""
         self._stale = True
         neighbors.sort_wall(wall)
 
@@ -56,6 +62,7 @@ class Motion:
         if self._stale:
             self.before_build()
             self.neighbors.build(self.particles, self.wall)
+            self._wall_moved = 0.0
         self.model.accelerate(self.particles, self.wall, self.neighbors, self.gravity)
         speed, acceleration, broken = survey(self.particles)
         if broken or speed > self.speed_limit:
@@ -63,10 +70,13 @@ class Motion:
         stable = min(self.model.stable_step(speed, acceleration), self.step_limit)
         # Equal steps to the end of the frame, so that none is a sliver.
         dt = remaining / max(1, math.ceil(remaining / stable * (1.0 - 1e-9)))
+        self.before_drift(dt)
         moved2, corrected = kick_drift(
-            self.particles, self.wall, self.neighbors, self.printed_integrator, dt
+            self.particles, self.wall, self.neighbors, self.plugs, self.printed_integrator, dt
         )
-        self._stale = 4.0 * moved2 > self.neighbors.skin**2
+        # Two particles, or one and a proxy, may have come nearer to each other by more.
+        moved = math.sqrt(moved2)
+        self._stale = moved + max(moved, self._wall_moved) > self.neighbors.skin
         self.wall_corrections += int(corrected)
         self.last_step = dt
         self.fallback_time += dt * self.model.fell_back
@@ -81,13 +91,20 @@ class Motion:
     def before_build(self) -> None:
         """Mark particles that are to be removed; nothing here."""
 
-    def advance_to(self, time: float) -> None:
-        """Step until a simulated time [s].
+    def before_drift(self, dt: float) -> None:
+        """Move what moves blood, by a step of dt [s]; nothing here."""
+
+    def advance_to(self, time: float, before_step: Callable[[], None] | None = None) -> None:
+        """Step until a simulated time [s]; `before_step` is called before each step.
 
         Raises:
             RunError: as `step`.
         """
-        while self.time < time * (1.0 - 1e-12) and self.particles.count[None] > 0:
+        while self.time < time * (1.0 - 1e-12):
+            if before_step is not None:
+                before_step()
+            if self.particles.count[None] == 0:
+                break
             self.step(time - self.time)
         self.time = time
 

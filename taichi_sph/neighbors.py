@@ -194,6 +194,10 @@ class Neighbors:
     built: Points
     """Blood where it was when the lists were built."""
     proxies: Points
+    tool: Points
+    """Proxies of a tool, in no order: they are few and move."""
+    tool_ball: ti.Field
+    """Centre and radius of a ball that holds them [m], shape (4,); the radius 0 where none do."""
     order: ti.Field
     row_velocity: ti.MatrixField
     row_acceleration: ti.MatrixField
@@ -220,7 +224,9 @@ class Neighbors:
         reach = support_radius + skin
         blood = list_capacity(4.0 / 3.0 * math.pi * (reach / spacing) ** 3)
         # In a narrow tube or a corner twice a plane wall's proxies lie within reach.
-        walls = list_capacity(2.0 * math.pi * (reach / wall.spacing) ** 2)
+        walls = list_capacity(
+            (2.0 if wall.tool == 0 else 4.0) * math.pi * (reach / wall.spacing) ** 2
+        )
         return cls(
             grid=grid,
             support_radius=support_radius,
@@ -234,6 +240,8 @@ class Neighbors:
             rank=rank,
             built=Points.allocate(capacity, cells),
             proxies=Points.allocate(wall.count, cells),
+            tool=Points.allocate(wall.tool, 1),
+            tool_ball=ti.field(float, 4),
             order=ti.field(int, capacity),
             row_velocity=ti.Vector.field(3, float, capacity),
             row_acceleration=ti.Vector.field(3, float, capacity),
@@ -477,6 +485,15 @@ def build_lists(p: ti.template(), w: ti.template(), nb: ti.template()) -> ti.mat
                         bits = near_bits(nb.proxies, x_i, k, last_k, reach2)
                         walls = append(bits, k, i, nb.wall_capacity, walls, nb.wall_index)
                         k += RUN
+        if ti.static(w.tool > 0):
+            ball = ti.Vector([nb.tool_ball[0], nb.tool_ball[1], nb.tool_ball[2]])
+            far = nb.tool_ball[3] + ti.static(nb.support_radius + nb.skin)
+            if nb.tool_ball[3] > 0.0 and (x_i - ball).norm_sqr() < far * far:
+                k = 0
+                while k < ti.static(w.tool):
+                    bits = near_bits(nb.tool, x_i, k, ti.static(w.tool), reach2)
+                    walls = append(bits, w.count + k, i, nb.wall_capacity, walls, nb.wall_index)
+                    k += RUN
         nb.blood_count[i] = ti.min(blood, nb.blood_capacity)
         nb.wall_count[i] = ti.min(walls, nb.wall_capacity)
         ti.atomic_max(longest_blood, blood)

@@ -49,9 +49,12 @@ class Particles:
 
     @classmethod
     def from_numpy(
-        cls, position: np.ndarray, velocity: np.ndarray | None = None, mass: float = 1.0
-    ) -> "Particles":
+        cls, position: np.ndarray, velocity: np.ndarray | None = None, mass: float = 1.0,
+        room: int = 0,
+    ) -> "Particles":  # fmt: skip
         """Particles at given positions [m] and velocities [m/s] (at rest), shape (n, 3).
+
+        There is room for so many more.
 
         Raises:
             RunError: a position or velocity is not finite.
@@ -60,7 +63,7 @@ class Particles:
         velocity = np.zeros((n, 3)) if velocity is None else velocity
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise RunError("initial positions and velocities must be finite numbers")
-        particles = cls.allocate(n, mass)
+        particles = cls.allocate(n + room, mass)
         # One kernel for all: each field's own would cost some 0.05 s at start.
         place_rows(particles, *(np.ascontiguousarray(a, number()) for a in (position, velocity)))
         return particles
@@ -80,6 +83,20 @@ class Particles:
         order = np.argsort(self.identity.to_numpy()[:n])
         return field.to_numpy()[:n][order]
 
+    def copy_to(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> int:
+        """Copy the live rows into arrays of the caller, in one pass, in the order of the grid.
+
+        Args:
+            identity: int32, (m,).
+            position: [m], of the precision of the run, (m, 3).
+            velocity: [m/s], likewise.
+
+        Returns:
+            how many rows were written: what there is, or m if that is less.
+        """
+        copy_rows(self, identity, position, velocity)
+        return min(int(self.count[None]), len(identity))
+
     def identities(self) -> np.ndarray:
         """Live identities, ascending, shape (n,)."""
         return np.sort(self.identity.to_numpy()[: self.count[None]])
@@ -96,3 +113,18 @@ def place_rows(
             p.position[i][a] = position[i, a]
             p.velocity[i][a] = velocity[i, a]
         p.identity[i] = i
+
+
+@ti.kernel
+def copy_rows(
+    p: ti.template(),
+    identity: ti.types.ndarray(ndim=1),
+    position: ti.types.ndarray(ndim=2),
+    velocity: ti.types.ndarray(ndim=2),
+):
+    """Writes: the arrays, as far as they reach."""
+    for i in range(ti.min(p.count[None], identity.shape[0])):
+        identity[i] = p.identity[i]
+        for a in ti.static(range(3)):
+            position[i, a] = p.position[i][a]
+            velocity[i, a] = p.velocity[i][a]

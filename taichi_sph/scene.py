@@ -46,10 +46,41 @@ class OpeningTable(_Table):
     """A point near the middle of the opening [units of the surface file]."""
     state: Literal["open", "capped"] = "open"
     """Blood leaves through an open one and is counted; a capped one is wall."""
+    flow: Coordinate | None = None
+    """Blood that a pump drives in [m^3/s], out where negative."""
+    pressure: Coordinate | None = None
+    """Pressure that a reservoir holds there [Pa], over that outside the vessel."""
+    waveform: str | None = None
+    """What flow or pressure is multiplied by: the name of a built-in one, or a CSV file (time [s],
+    factor), relative to the scene file; it repeats.  Steady without."""
+
+    @property
+    def driven(self) -> bool:
+        """Whether a pump or a reservoir drives blood through it."""
+        return self.flow is not None or self.pressure is not None
+
+    def __post_init__(self) -> None:
+        if self.flow is not None and self.pressure is not None:
+            raise ValueError("give flow [m^3/s] or pressure [Pa], not both")
+        if self.driven and self.state == "capped":
+            raise ValueError("a capped opening has no flow and no pressure; set state = 'open'")
+        if self.waveform is not None and not self.driven:
+            raise ValueError("a waveform needs a flow [m^3/s] or a pressure [Pa] to multiply")
+
+
+class ToolTable(_Table):
+    """A rigid tool that a session moves."""
+
+    surface: str
+    """Closed surface file (STL, PLY, OBJ), relative to the scene file."""
+    position: Vector
+    """Where the origin of that file is at the start [m]: the tip, which suction is at."""
+    scale: Positive = 1.0
+    """Metres per unit of the surface file [m]."""
 
 
 class Column(_Table):
-    """The blood at the start: a column in the lumen, at rest.  Give height or particles."""
+    """The blood at the start: a column in the lumen, at rest.  Give height, particles or full."""
 
     opening: str
     """The opening that the column stands at."""
@@ -57,12 +88,16 @@ class Column(_Table):
     """Depth of the column, from its top inward along the opening's normal [m]."""
     particles: Annotated[int, msgspec.Meta(gt=0)] | None = None
     """Number of blood particles; the height follows from it."""
+    full: bool = False
+    """The whole lumen."""
     offset: NonNegative = 0.0
     """Distance from the opening's plane to the top of the column [m]."""
 
     def __post_init__(self) -> None:
-        if (self.height is None) == (self.particles is None):
-            raise ValueError("give height [m] or particles, one of the two")
+        if (self.height is not None) + (self.particles is not None) + self.full != 1:
+            raise ValueError("give height [m], particles or full = true, one of the three")
+        if self.full and self.offset:
+            raise ValueError("an offset [m] leaves no full lumen")
 
 
 class NewtonianTable(_Table, tag_field="model", tag="newtonian"):
@@ -132,6 +167,7 @@ class Scene(_Table):
     openings: dict[str, OpeningTable] = {}
     """Openings by name; one that the surface has and the scene does not name is capped."""
     blood: Blood = Blood()
+    tool: ToolTable | None = None
     folder: str = "."
     """Where relative paths start: the scene file's folder (set by the reader)."""
     name: str = "scene"
@@ -157,6 +193,7 @@ _TABLES = {
     "blood": Blood,
     "discretization": Discretization,
     "openings": OpeningTable,
+    "tool": ToolTable,
 }
 _SET_BY_READER = ("folder", "name", "text")
 

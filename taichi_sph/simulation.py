@@ -1,25 +1,34 @@
 """Simulation: the blood of a scene in its vessel."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import taichi as ti
+from scipy.spatial.transform import Rotation
 
-from taichi_sph.acceleration import AccelerationModel, Fluid, SphAcceleration
+from taichi_sph.acceleration import AccelerationModel, Fluid, SphAcceleration, force_on_tool
 from taichi_sph.calibration import calibrate
 from taichi_sph.derived import Derived, derive
 from taichi_sph.diagnostics import Diagnostics, diagnose
 from taichi_sph.equation_of_state import Tait
-from taichi_sph.errors import InputError
+from taichi_sph.errors import InputError, RunError
+from taichi_sph.exits import LOST, SUCTION, Exits
 from taichi_sph.motion import Motion
 from taichi_sph.neighbors import Neighbors, cells_within, make_grid
 from taichi_sph.particles import Particles
+from taichi_sph.pistons import LEAST_APART, Piston, Pistons, add_blood, plug_sites, sleeve
 from taichi_sph.rheology import rheology_of
+from taichi_sph.runtime import number
 from taichi_sph.scene import Scene
 from taichi_sph.smoothing_kernels import WendlandC2
+from taichi_sph.surgery import MOST_WOUNDS, Surgery, Wound
+from taichi_sph.tool import Tool, read_shape
 from taichi_sph.vessel import Vessel, read_vessel
 from taichi_sph.wall import Wall
+from taichi_sph.waveform import read_waveform
 
 ModelMaker = Callable[[Fluid, int], AccelerationModel]
 """Makes a model for a fluid and a number of particles."""
@@ -32,35 +41,8 @@ pours A fastest with 0.1 and the physics, whose steps are short, is 7 % faster w
 OPENING_REACH = 2.5
 """Blood beyond an opening's plane has left by it within this many radii of its centre."""
 
-LOST = -2
-"""identity of a particle that left the grid's box; drained ones have -3 - opening."""
-
-
-@ti.kernel
-def mark_removed(
-    p: ti.template(),
-    grid: ti.template(),
-    centre: ti.template(),
-    normal: ti.template(),
-    reach: ti.template(),
-    removed: ti.template(),
-):
-    """Mark blood beyond an open opening, or out of the box.  Writes: identity, removed."""
-    for i in range(p.count[None]):
-        x = p.position[i]
-        for k in range(centre.shape[0]):
-            r = x - centre[k]
-            beyond = reach[k] > 0.0 and r.dot(normal[k]) > 0.0 and r.norm() < reach[k]
-            if beyond and p.identity[i] >= 0:
-                p.identity[i] = LOST - 1 - k
-                ti.atomic_add(removed[k], 1)
-        if p.identity[i] >= 0:
-            for a in ti.static(range(3)):
-                upper = grid.lower[a] + grid.cell[a] * grid.shape[a]
-                outside = x[a] < grid.lower[a] or x[a] > upper
-                if outside and p.identity[i] >= 0:
-                    p.identity[i] = LOST
-                    ti.atomic_add(removed[centre.shape[0]], 1)
+DROP_TIME = 0.3
+"""Drops that have left through a wound are shown for this long [s]: they fall 0.4 m."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +57,10 @@ class Snapshot:
     """[s]"""
     steps: int
     wall_corrections: int
+    controls: dict[str, Any]
+    """What was done to the run: gravity, wounds, tool, pistons; numbers, lists and names only."""
     removed: np.ndarray
-    """Particles that left by each opening, then those lost, (openings + 1,)."""
+    """Particles that have left by each place of the account, see `taichi_sph.exits`."""
     identity: np.ndarray
     """(n,)"""
     position: np.ndarray
@@ -105,12 +89,33 @@ class Simulation(Motion):
         wall_spacing = grid.wall_spacing_ratio * grid.spacing
         calibration = calibrate(kernel, grid.spacing, wall_spacing, scene.blood.density)
         setback = calibration.setback
-        sample = vessel.sample_wall(wall_spacing, setback, seed)
-        blood = vessel.fill_column(scene.column, grid.spacing)
         self.scene = scene
         self.vessel = vessel
-        self.derived: Derived = derive(scene, vessel, len(blood), len(sample.positions))
-        fluid = Fluid(
+        plugs = Pistons(
+            make_pistons(scene, vessel), grid.spacing, kernel.support_radius, scene.blood.density
+        )
+        sample = vessel.sample_wall(wall_spacing, setback, seed)
+        proxies, normals = [sample.positions], [sample.normals]
+        for piston in plugs.each:
+            rim = vessel.rim(vessel.openings.index(piston.opening))
+            tube = sleeve(rim, piston.opening, wall_spacing, setback, plugs.gates.depth)
+            proxies.append(tube[0])
+            normals.append(tube[1])
+        tool = make_tool(scene, vessel, wall_spacing, setback, kernel)
+        column = vessel.fill_column(scene.column, grid.spacing)
+        if tool.shape is not None and len(column):
+            about = column - tool.position
+            clear = tool.shape.distance(about) > 0.5 * grid.spacing
+            column = column[clear & tool.shape.clear_of(about)]
+        blood = np.concatenate([column, plugs.initial_blood(column)])
+        # What flows in may fill the vessel and pack it closer than the lattice did.
+        room = 0
+        if plugs.each:
+            full = vessel.volume / grid.spacing**3 + plugs.capacity
+            room = max(0, math.ceil(1.1 * full) - len(blood))
+        self._initial = blood
+        self.derived: Derived = derive(scene, vessel, len(blood), sum(map(len, proxies)))
+        self.fluid = Fluid(
             kernel=kernel,
             state=Tait(scene.blood.density, self.derived.sound_speed),
             rheology=rheology_of(scene.blood.rheology),
@@ -119,17 +124,22 @@ class Simulation(Motion):
             courant_number=grid.courant_number,
             nested=grid.viscous_form == "nested",
         )
-        particles = Particles.from_numpy(blood, mass=scene.blood.density * grid.spacing**3)
-        wall = Wall.from_numpy(sample.positions, sample.normals, kernel, setback, wall_spacing)
+        particles = Particles.from_numpy(
+            blood, mass=scene.blood.density * grid.spacing**3, room=room
+        )
+        wall = Wall.from_numpy(
+            np.concatenate(proxies), np.concatenate(normals), kernel, setback, wall_spacing,
+            tool=tool.count,
+        )  # fmt: skip
         skin = SKIN * kernel.support_radius
-        margin = 2.0 * (kernel.support_radius + skin)
+        margin = 2.0 * (kernel.support_radius + skin) + (plugs.gates.depth if plugs.each else 0.0)
         lower, upper = vessel.vertices.min(axis=0) - margin, vessel.vertices.max(axis=0) + margin
         cells = make_grid(lower, upper, kernel.support_radius + skin)
         neighbors = Neighbors.allocate(
             cells,
             kernel.support_radius,
             skin,
-            len(blood),
+            particles.capacity,
             grid.spacing,
             wall,
             # The wall's proxies, and blood that leaves through an opening, are within this.
@@ -139,21 +149,32 @@ class Simulation(Motion):
             particles,
             wall,
             neighbors,
-            make_model(fluid, len(blood)),
+            make_model(self.fluid, particles.capacity),
             scene.gravity,
             # Faster than sound the equation of state means nothing.
             speed_limit=self.derived.sound_speed,
             integrator=grid.integrator,
         )
-        openings = vessel.openings
-        self._opening_centre = ti.Vector.field(3, float, max(1, len(openings)))
-        self._opening_normal = ti.Vector.field(3, float, max(1, len(openings)))
-        self._opening_reach = ti.field(float, max(1, len(openings)))
-        self._removed = ti.field(int, max(1, len(openings)) + 1)
-        for k, opening in enumerate(openings):
-            self._opening_centre[k] = opening.centre
-            self._opening_normal[k] = opening.normal
-            self._opening_reach[k] = OPENING_REACH * opening.radius if opening.is_open else 0.0
+        if plugs.each:
+            self.plugs = plugs
+        self._pistons = plugs
+        self.exits = Exits(len(vessel.openings) + MOST_WOUNDS)
+        for k, opening in enumerate(vessel.openings):
+            if opening.is_open:
+                driven = scene.openings[opening.name].driven
+                beyond = (plugs.far_end if driven else 0.0) * opening.normal
+                self.exits.open(
+                    k, opening.centre + beyond, opening.centre + beyond, opening.normal,
+                    OPENING_REACH * opening.radius,
+                )  # fmt: skip
+        self.surgery = Surgery(
+            vessel, wall, neighbors, self.exits, len(vessel.openings), kernel, grid.spacing, tool
+        )
+        self.added = 0
+        """Particles that pistons have added."""
+        self._next_identity = len(blood)
+        self._impulse = np.zeros(3)
+        self._impulse_time = 0.0
 
     @classmethod
     def from_scene(
@@ -184,9 +205,20 @@ class Simulation(Motion):
             )
         self.put(np.arange(len(position)), position, velocity)
         particles.acceleration.fill(0.0)
-        self._removed.fill(0)
+        self.exits.removed.fill(0)
+        self.added, self._next_identity = 0, len(position)
         self.time = self.last_step = self.fallback_time = 0.0
         self.steps = self.wall_corrections = 0
+
+    def reset(self) -> None:
+        """Blood, pistons, wounds, tool and gravity as at the start; clock and steps go on."""
+        clock = self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections
+        self.place(self._initial, np.zeros_like(self._initial))
+        self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections = clock
+        self.gravity = self.scene.gravity
+        for piston in self._pistons.each:
+            piston.start_again()
+        self.surgery.start_again(self.time)
 
     def put(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
         """Replace the blood: identities (n,), positions [m] and velocities [m/s], (n, 3)."""
@@ -201,9 +233,17 @@ class Simulation(Motion):
         """
         p, n = self.particles, self.particles.count[None]
         self._stale = True
+        controls = {
+            "model": self.model.name,
+            "gravity": list(self.gravity),
+            "added": self.added,
+            "next_identity": self._next_identity,
+            "pistons": [piston.state() for piston in self._pistons.each],
+            **self.surgery.state(),
+        }
         return Snapshot(
             self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections,
-            self._removed.to_numpy(),
+            controls, self.exits.account(),
             *(
                 field.to_numpy()[:n]
                 for field in (p.identity, p.position, p.velocity, p.acceleration, p.density)
@@ -211,16 +251,16 @@ class Simulation(Motion):
         )  # fmt: skip
 
     def go_on_from(self, state: Snapshot) -> None:
-        """Go on from a state of the same scene and model.
+        """Go on from a state of the same scene, under the model that it names.
 
         Raises:
             InputError: it is of another number of openings, or there is no room for so many.
         """
         n, p = len(state.identity), self.particles
-        if n > p.capacity or state.removed.shape != self._removed.shape:
+        if n > p.capacity or state.removed.shape != self.exits.account().shape:
             raise InputError(
-                f"a state of {n} particles and {len(state.removed) - 1} openings: the scene has "
-                f"{p.capacity} and {self._removed.shape[0] - 1}"
+                f"a state of {n} particles and an account of {len(state.removed)} places: the "
+                f"scene has {p.capacity} and {len(self.exits.account())}"
             )
         p.replace(
             identity=state.identity,
@@ -229,23 +269,130 @@ class Simulation(Motion):
             acceleration=state.acceleration,
             density=state.density,
         )
-        self._removed.from_numpy(state.removed)
+        self.exits.removed.from_numpy(state.removed)
         self.time, self.last_step, self.fallback_time = (
             state.time, state.last_step, state.fallback_time
         )  # fmt: skip
         self.steps, self.wall_corrections = state.steps, state.wall_corrections
+        controls = state.controls
+        x, y, z = controls["gravity"]
+        self.gravity = (x, y, z)
+        self.added, self._next_identity = controls["added"], controls["next_identity"]
+        for piston, row in zip(self._pistons.each, controls["pistons"], strict=True):
+            piston.go_on_from(row)
+        self.surgery.go_on_from(controls)
         self._stale = True
 
+    def switch(self, model: AccelerationModel) -> None:
+        """Let another model, made by `model_of`, compute accelerations from now on."""
+        self.model = model
+
+    def model_of(self, make_model: ModelMaker) -> AccelerationModel:
+        """A model for this simulation; its fields stay in memory for good."""
+        return make_model(self.fluid, self.particles.capacity)
+
+    def rehearse(self, models: list[AccelerationModel]) -> None:
+        """Have models compile what they need, before anybody waits for it; nothing moves."""
+        self.neighbors.build(self.particles, self.wall)
+        for model in models:
+            acceleration = self.particles.acceleration.to_numpy()
+            model.accelerate(self.particles, self.wall, self.neighbors, self.gravity)
+            self.particles.acceleration.from_numpy(acceleration)
+            if self.wall.tool and model.pairwise is not None:
+                force_on_tool(self.particles, self.wall, self.neighbors, *model.pairwise)
+        self.surgery.rehearse(self.particles)
+        self._stale = True
+
+    @property
+    def pistons(self) -> list[Piston]:
+        """What drives the openings."""
+        return self._pistons.each
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of the box that blood may be in [m]."""
+        grid = self.neighbors.grid
+        low = np.array(grid.lower)
+        return low, low + np.array(grid.cell) * np.array(grid.shape)
+
+    def drive(self, factor: float, opening: str | None = None) -> None:
+        """Multiply what drives an opening, or all, by a factor; it takes 0.05 s to get there.
+
+        Raises:
+            InputError: nothing drives that opening.
+        """
+        chosen = [p for p in self._pistons.each if opening in (None, p.opening.name)]
+        if not chosen:
+            names = ", ".join(p.opening.name for p in self._pistons.each) or "none"
+            raise InputError(f"inflow: nothing drives {opening or 'this scene'}; driven: {names}")
+        for piston in chosen:
+            piston.asked = factor
+
+    def wound(self, centre: np.ndarray, radius: float, end: np.ndarray | None = None) -> Wound:
+        """Open the wall: see `Surgery.wound`."""
+        self._stale = True
+        return self.surgery.wound(centre, radius, end)
+
+    def clamp(self, number: int | None = None) -> None:
+        """Close a wound, or all: see `Surgery.clamp`."""
+        self._stale = True
+        numbers = range(len(self.surgery.wounds)) if number is None else [number]
+        for each in numbers:
+            self.surgery.clamp(each, self.particles, self.time)
+
+    def suck(self, rate: float, radius: float | None = None) -> None:
+        """Suck away at most `rate` [m^3/s] of the blood within a radius [m] of the tool's tip."""
+        self.surgery.suction_rate = rate
+        self.surgery.suction_radius = radius or 2.0 * self.scene.discretization.spacing
+
+    def move_tool(self, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
+        """Say where the tool is wanted: position [m], rotation as a quaternion w, x, y, z."""
+        tool = self.surgery.tool
+        tool.wanted_position = np.asarray(position, float)
+        if rotation is not None:
+            tool.wanted_rotation = Rotation.from_quat(np.roll(rotation, -1))
+
+    def take_force(self) -> np.ndarray:
+        """Force of the blood on the tool, mean since this was last asked [N], (3,)."""
+        force = self._impulse / self._impulse_time if self._impulse_time else np.zeros(3)
+        self._impulse, self._impulse_time = np.zeros(3), 0.0
+        return force
+
     def before_build(self) -> None:
-        """Mark what has left through an opening, or out of the box."""
-        mark_removed(
-            self.particles,
-            self.neighbors.grid,
-            self._opening_centre,
-            self._opening_normal,
-            self._opening_reach,
-            self._removed,
-        )
+        """Add what pistons bring and mark what has left: by exits, by suction, out of the box.
+
+        Raises:
+            RunError: there is no room for so much blood.
+        """
+        self.exits.mark(self.particles, self.neighbors.grid, self.time)
+        self.surgery.before_build(self.particles, self.time)
+        position, velocity = self._pistons.new_blood()
+        if len(position):
+            room = self.particles.capacity - self.particles.count[None]
+            if room < len(position):
+                raise RunError(
+                    f"the run diverged: at t = {self.time:.6g} s the vessel is over-full, "
+                    f"{self.particles.capacity} particles; likely cause: more is driven in than "
+                    "can leave, or the pressure is too high for the sound speed"
+                )
+            added = add_blood(
+                self.particles, self._pistons.gates,
+                *(np.ascontiguousarray(a, number()) for a in (position, velocity)),
+                np.zeros(len(position), np.int32), self._next_identity,
+                (LEAST_APART * self.scene.discretization.spacing) ** 2,
+            )  # fmt: skip
+            self.added += added
+            self._next_identity += added
+
+    def before_drift(self, dt: float) -> None:
+        """Move plugs and tool by a step of dt [s]."""
+        if self._pistons.each:
+            self._pistons.advance(self.particles, self.time, dt, self.gravity)
+        if self.wall.tool and self.model.pairwise is not None:
+            force = force_on_tool(self.particles, self.wall, self.neighbors, *self.model.pairwise)
+            self._impulse += dt * np.array([force[0], force[1], force[2]])
+            self._impulse_time += dt
+        self._wall_moved += self.surgery.before_drift(dt)
 
     def positions(self) -> np.ndarray:
         """Positions of the live blood [m], shape (n, 3), in order of identity."""
@@ -259,11 +406,60 @@ class Simulation(Motion):
         """Identities of the live blood, ascending, shape (n,)."""
         return self.particles.identities()
 
+    def drops(self) -> np.ndarray:
+        """Blood that has lately left through wounds, as it falls [m], (n, 3)."""
+        return self.exits.drops(self.time, np.asarray(self.gravity), DROP_TIME)
+
     def diagnostics(self) -> Diagnostics:
         """Figures of the present state; leaks are counted against the surface itself."""
-        removed = self._removed.to_numpy()
+        account = self.exits.account()
         names = [o.name for o in self.vessel.openings]
-        drained = {name: int(n) for name, n in zip(names, removed, strict=False)}
+        exits = account[2:]
+        drained = {name: int(n) for name, n in zip(names, exits, strict=False)}
         density = self.particles.in_order(self.particles.density)
-        leaks = self.vessel.count_leaks(self.positions()) + int(removed[-1])
-        return diagnose(self, density, drained, leaks)
+        x = self.positions()
+        held = np.ones(len(x), bool)
+        for wound in self.surgery.wounds:
+            # Blood in the hole has not leaked.
+            held &= wound.distance(x) > wound.radius + 3.0 * self.scene.discretization.spacing
+        leaks = self.vessel.count_leaks(x[held]) + int(account[LOST])
+        return diagnose(
+            self, density, drained, leaks,
+            added=self.added, bled=int(exits[len(names) :].sum()), sucked=int(account[SUCTION]),
+        )  # fmt: skip
+
+
+def make_pistons(scene: Scene, vessel: Vessel) -> list[Piston]:
+    """What drives the openings of a scene.
+
+    Raises:
+        InputError: a waveform that cannot be read, an opening too narrow for one particle.
+    """
+    pistons = []
+    for k, opening in enumerate(vessel.openings):
+        table = scene.openings[opening.name]
+        if table.driven:
+            sites = plug_sites(vessel.rim(k), opening, scene.discretization.spacing)
+            if len(sites) == 0:
+                raise InputError(
+                    f"openings.{opening.name}: too narrow to be driven at spacing "
+                    f"{scene.discretization.spacing:g} m"
+                )
+            waveform = read_waveform(table.waveform, Path(scene.folder))
+            pistons.append(Piston(opening, table.flow, table.pressure, waveform, sites))
+    return pistons
+
+
+def make_tool(
+    scene: Scene, vessel: Vessel, spacing: float, setback: float, kernel: WendlandC2
+) -> Tool:
+    """The scene's tool or, without one, a point outside the column's opening.
+
+    Raises:
+        InputError: its surface cannot be used.
+    """
+    if scene.tool is None:
+        opening = vessel.opening(scene.column.opening)
+        return Tool(None, opening.centre + opening.radius * opening.normal)
+    shape = read_shape(scene.tool, Path(scene.folder), spacing, setback, kernel)
+    return Tool(shape, np.array(scene.tool.position))

@@ -121,6 +121,22 @@ class Vessel:
         """Distance of points (k, 3) to the closed surface [m], (k,)."""
         return self._nearest(points)[0]
 
+    def nearest_wall(self, points: Floats) -> tuple[Floats, Integers, Floats, Floats]:
+        """Places on the surface nearest to points (k, 3) [m].
+
+        Returns:
+            distances [m] (k,), triangles (k,), places [m] (k, 3), unit normals outward (k, 3).
+        """
+        away, triangle, places = self._nearest(points)
+        normals = wall_sampling.normals_at(self.vertices, self._triangles, places, triangle)
+        return away, triangle, places, normals
+
+    def rim(self, number: int) -> Floats:
+        """Closed polygon round opening `number` [m], (n, 3)."""
+        loops = surface.boundary_loops(self._triangles[self.face_opening == number])
+        longest = max(loops, key=len)
+        return self.vertices[longest]
+
     def signed_distance(self, points: Floats) -> Floats:
         """Distance of points (k, 3) to the closed surface [m], negative within the lumen, (k,)."""
         return np.where(self.contains(points), -1.0, 1.0) * self.distance(points)

@@ -93,6 +93,7 @@ class Prescribed:
     step: float
     name: str = "prescribed"
     fell_back: bool = False
+    pairwise: None = None
 
     def accelerate(self, particles, wall, neighbors, gravity) -> None:
         """Write the law's acceleration and the rest density."""

@@ -43,6 +43,60 @@ def test_pipe_start_up_obeys_the_momentum_equation():
     assert accelerated[5:-5] == pytest.approx(DRIVE + viscous, abs=1e-3 * DRIVE)
 
 
+def _pulsation(number, r, phase):
+    """Speed at a Womersley number and a part of the period, and its angular frequency."""
+    w = ETA / DENSITY * (number / RADIUS) ** 2
+    time = phase * 2.0 * math.pi / w
+    return analytic.pipe_pulsation(r, time, RADIUS, DRIVE, w, ETA, DENSITY), w
+
+
+@pytest.mark.parametrize("number", [0.5, 4.0, 15.0])
+@pytest.mark.parametrize("phase", [0.0, 0.2, 0.7])
+def test_a_pulsating_pipe_obeys_the_momentum_equation_and_sticks_to_the_wall(number, phase):
+    r = np.linspace(0.0, RADIUS, 4001)
+    u, w = _pulsation(number, r, phase)
+    part = 1e-4
+    rise = _pulsation(number, r, phase + part)[0] - _pulsation(number, r, phase - part)[0]
+    accelerated = DENSITY * rise / (2.0 * part * 2.0 * math.pi / w)
+    slope = np.gradient(u, r, edge_order=2)
+    viscous = ETA * np.gradient(r * slope, r, edge_order=2)[5:-5] / r[5:-5]
+    driven = DRIVE * math.cos(2.0 * math.pi * phase)
+    assert accelerated[5:-5] == pytest.approx(driven + viscous, abs=1e-3 * DRIVE)
+    assert abs(u[-1]) < 1e-12 * DRIVE / (DENSITY * w)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.1, 0.5])
+def test_a_slow_pulse_is_poiseuille_flow_at_every_moment(phase):
+    r = np.linspace(0.0, RADIUS, 50)
+    steady = analytic.pipe_speed(r, RADIUS, DRIVE, ETA)
+    u, _ = _pulsation(0.05, r, phase)
+    assert u == pytest.approx(steady * math.cos(2.0 * math.pi * phase), abs=1e-3 * steady.max())
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.1, 0.25])
+def test_a_fast_pulse_moves_blood_as_a_plug_a_quarter_period_late(phase):
+    r = np.linspace(0.0, 0.7 * RADIUS, 50)
+    u, w = _pulsation(50.0, r, phase)
+    plug = DRIVE / (DENSITY * w)
+    assert u == pytest.approx(plug * math.sin(2.0 * math.pi * phase), abs=1e-3 * plug)
+
+
+@pytest.mark.parametrize("number", [0.5, 4.0, 15.0])
+def test_a_pulsating_profile_carries_the_pulsating_flow_rate(number):
+    r = np.linspace(0.0, RADIUS, 20001)
+    at_zero, w = _pulsation(number, r, 0.0)
+    a_quarter_on, _ = _pulsation(number, r, 0.25)
+    rate = analytic.pipe_pulsation_flow_rate(RADIUS, DRIVE, w, ETA, DENSITY)
+    assert _flow_rate(r, at_zero) == pytest.approx(rate.real, abs=1e-6 * abs(rate))
+    assert _flow_rate(r, a_quarter_on) == pytest.approx(-rate.imag, abs=1e-6 * abs(rate))
+
+
+def test_the_womersley_number_of_an_artery():
+    # 5.4 mm across, 70 beats a minute.
+    number = analytic.womersley_number(2.7e-3, 2.0 * math.pi * 70.0 / 60.0, ETA, DENSITY)
+    assert number == pytest.approx(4.0, rel=0.01)
+
+
 def test_channel_start_up_obeys_the_momentum_equation():
     width = 2e-3
     y = np.linspace(0.0, width, 2001)

@@ -15,7 +15,7 @@ from builders import (
     precision,
     sphere,
 )
-from taichi_sph.integrator import WALL_MARGIN, kick_drift, survey
+from taichi_sph.integrator import NO_PLUGS, WALL_MARGIN, kick_drift, survey
 from taichi_sph.motion import Motion
 
 MAP = {"f64": 1e-9, "f32": 1e-3}
@@ -49,7 +49,7 @@ def one_step_map(printed: bool, w: float) -> np.ndarray:
     acceleration = np.zeros((CAPACITY, 3), number())
     acceleration[:2] = spring(stage.particles.position.to_numpy()[:2].astype(float))
     stage.particles.acceleration.from_numpy(acceleration)
-    kick_drift(stage.particles, stage.wall, stage.neighbors, printed, dt)
+    kick_drift(stage.particles, stage.wall, stage.neighbors, NO_PLUGS, printed, dt)
     after_x = (stage.in_order(stage.particles.position) - MIDDLE) / small
     after_v = stage.in_order(stage.particles.velocity) / (OMEGA * small)
     return np.stack([after_x, after_v], axis=1)
@@ -139,7 +139,7 @@ def test_blood_that_leaves_a_period_comes_in_again_on_the_other_side():
         stage.in_order(stage.particles.position)[0], expected, atol=SURFACE[precision()] * D, rtol=0
     )
     # How far it has moved since the lists were built is told across the period's end.
-    moved2, _ = kick_drift(stage.particles, stage.wall, stage.neighbors, False, 0.0)
+    moved2, _ = kick_drift(stage.particles, stage.wall, stage.neighbors, NO_PLUGS, False, 0.0)
     assert np.sqrt(moved2) == pytest.approx(np.hypot(0.2, 0.2) * D, rel=1e-4)
 
 

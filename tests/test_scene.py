@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from taichi_sph.errors import InputError
-from taichi_sph.scene import CassonTable, NewtonianTable, parse_scene, read_scene
+from taichi_sph.scene import CassonTable, NewtonianTable, ToolTable, parse_scene, read_scene
 
 GOOD = """
 title = "Tube"
@@ -44,13 +44,13 @@ MISTAKES = {
         "duration = 0.1",
         "duration = 0.1\ncolour = 3",
         "scene.toml: unknown key colour; allowed: title, vessel, column, discretization, duration, "
-        "frame_interval, gravity, openings, blood",
+        "frame_interval, gravity, openings, blood, tool",
     ),
     "unknown table": (
         "[column]",
         "[colum]",
         "scene.toml: unknown key colum; allowed: title, vessel, column, discretization, duration, "
-        "frame_interval, gravity, openings, blood",
+        "frame_interval, gravity, openings, blood, tool",
     ),
     "key of another law": (
         'model = "casson"',
@@ -125,12 +125,105 @@ MISTAKES = {
     "neither height nor particles": (
         "height = 0.01",
         "",
-        "scene.toml: column: give height [m] or particles, one of the two",
+        "scene.toml: column: give height [m], particles or full = true, one of the three",
     ),
     "height and particles": (
         "height = 0.01",
         "height = 0.01\nparticles = 100",
-        "scene.toml: column: give height [m] or particles, one of the two",
+        "scene.toml: column: give height [m], particles or full = true, one of the three",
+    ),
+    "height and full": (
+        "height = 0.01",
+        "height = 0.01\nfull = true",
+        "scene.toml: column: give height [m], particles or full = true, one of the three",
+    ),
+    "not full": (
+        "height = 0.01",
+        "full = false",
+        "scene.toml: column: give height [m], particles or full = true, one of the three",
+    ),
+    "full below an offset": (
+        "height = 0.01",
+        "full = true\noffset = 0.002",
+        "scene.toml: column: an offset [m] leaves no full lumen",
+    ),
+    "full of text": (
+        "height = 0.01",
+        'full = "yes"',
+        "scene.toml: column.full: found 'yes'; expected bool",
+    ),
+    "flow and pressure": (
+        'state = "open"',
+        "flow = 1e-5\npressure = 0.0",
+        "scene.toml: openings.top: give flow [m^3/s] or pressure [Pa], not both",
+    ),
+    "flow through a capped opening": (
+        'state = "open"',
+        'state = "capped"\nflow = 1e-5',
+        "scene.toml: openings.top: a capped opening has no flow and no pressure; "
+        "set state = 'open'",
+    ),
+    "pressure at a capped opening": (
+        'state = "open"',
+        'state = "capped"\npressure = 0.0',
+        "scene.toml: openings.top: a capped opening has no flow and no pressure; "
+        "set state = 'open'",
+    ),
+    "waveform of nothing": (
+        'state = "open"',
+        'waveform = "common_carotid"',
+        "scene.toml: openings.top: a waveform needs a flow [m^3/s] or a pressure [Pa] to multiply",
+    ),
+    "flow with its unit": (
+        'state = "open"',
+        'flow = "20 ml/s"',
+        "scene.toml: openings.top.flow: found '20 ml/s'; expected float | null",
+    ),
+    "endless pressure": (
+        'state = "open"',
+        "pressure = -inf",
+        "scene.toml: openings.top.pressure: found -inf; expected float > -1000000000000.0",
+    ),
+    "waveform by a number": (
+        'state = "open"',
+        "flow = 1e-5\nwaveform = 3",
+        "scene.toml: openings.top.waveform: found 3; expected str | null",
+    ),
+    "unknown key of an opening": (
+        'state = "open"',
+        "flux = 1e-5",
+        "scene.toml: openings.top: unknown key flux; allowed: centre, state, flow, pressure, "
+        "waveform",
+    ),
+    "tool without a place": (
+        "[column]",
+        '[tool]\nsurface = "needle.stl"\n\n[column]',
+        "scene.toml: tool: the key position is missing",
+    ),
+    "tool without a surface": (
+        "[column]",
+        "[tool]\nposition = [0.0, 0.0, 0.0]\n\n[column]",
+        "scene.toml: tool: the key surface is missing",
+    ),
+    "tool in two dimensions": (
+        "[column]",
+        '[tool]\nsurface = "needle.stl"\nposition = [0.0, 0.0]\n\n[column]',
+        "scene.toml: tool.position: found [0.0, 0.0]; expected array of length 3",
+    ),
+    "tool of no size": (
+        "[column]",
+        '[tool]\nsurface = "needle.stl"\nposition = [0.0, 0.0, 0.0]\nscale = 0\n\n[column]',
+        "scene.toml: tool.scale: found 0; expected float > 0.0",
+    ),
+    "unknown key of the tool": (
+        "[column]",
+        '[tool]\nsurface = "needle.stl"\nposition = [0.0, 0.0, 0.0]\nspeed = 1.0\n\n[column]',
+        "scene.toml: tool: unknown key speed; allowed: surface, position, scale",
+    ),
+    "tool by its name": (
+        "[vessel]",
+        'tool = "needle"\n\n[vessel]',
+        "scene.toml: tool: found 'needle'; expected object | null",
     ),
     "opening that is not there": (
         'opening = "top"',
@@ -181,6 +274,31 @@ def test_scene_is_what_the_file_says():
     assert scene.openings["top"].centre == (0.0, 0.0, 1.0)
     assert scene.blood.rheology == CassonTable()
     assert (scene.folder, scene.name, scene.text) == ("/somewhere", "tube", GOOD)
+
+
+def test_an_opening_is_driven_by_a_flow_or_a_pressure_and_by_nothing_else():
+    still = parse(GOOD).openings["top"]
+    assert (still.driven, still.flow, still.pressure, still.waveform) == (False, None, None, None)
+    pump = parse(GOOD.replace('state = "open"', 'flow = -2e-5\nwaveform = "beat.csv"'))
+    top = pump.openings["top"]
+    assert (top.driven, top.flow, top.pressure, top.waveform) == (True, -2e-5, None, "beat.csv")
+    assert top.state == "open"
+    # A reservoir at the pressure outside still drives: blood may come back from it.
+    reservoir = parse(GOOD.replace('state = "open"', "pressure = 0")).openings["top"]
+    assert (reservoir.driven, reservoir.flow, reservoir.pressure) == (True, None, 0.0)
+
+
+def test_a_column_may_fill_the_whole_lumen():
+    column = parse(GOOD.replace("height = 0.01", "full = true")).column
+    assert (column.full, column.height, column.particles) == (True, None, None)
+    assert not parse(GOOD).column.full
+
+
+def test_a_tool_is_a_surface_at_a_place():
+    assert parse(GOOD).tool is None
+    table = '[tool]\nsurface = "needle.stl"\nposition = [0.0, 0.01, -0.02]\n\n[column]'
+    tool = parse(GOOD.replace("[column]", table)).tool
+    assert tool == ToolTable(surface="needle.stl", position=(0.0, 0.01, -0.02), scale=1.0)
 
 
 def test_the_law_of_viscosity_is_chosen_by_its_name():

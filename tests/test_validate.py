@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.validate import CASES, Curve, Report, Row, main, relative_l2, table_of
+from app.validate import CASES, Curve, Report, Row, harmonic, main, relative_l2, table_of, watched
 from taichi_sph.errors import InputError
+from taichi_sph.motion import Motion
 
 
 def test_an_unknown_case_is_refused_with_the_names_that_exist():
-    with pytest.raises(InputError, match=r"--only womersley: allowed are kernel, momentum"):
-        main(only=["womersley"])
+    with pytest.raises(InputError, match=r"--only couette: allowed are kernel, momentum"):
+        main(only=["couette"])
 
 
 def test_case_names_are_unique():
@@ -34,6 +35,35 @@ def test_a_row_that_misses_says_so():
 
 def test_the_relative_error_is_of_the_norms():
     assert relative_l2(np.array([3.0, 0.0]), np.array([3.0, 4.0])) == pytest.approx(0.8)
+
+
+def test_a_harmonic_is_found_beside_a_constant_and_another_one():
+    w, time = 3.0, np.arange(1, 41) / 40.0 * 2.0 * math.pi / 3.0
+    amplitude = 2.0 * np.exp(-1.1j)
+    values = np.real(amplitude * np.exp(1j * w * time)) + 0.7 + 0.5 * np.cos(2.0 * w * time)
+    assert harmonic(time, values, w) == pytest.approx(amplitude)
+
+
+class Clock(Motion):
+    """Stands in for a `Motion`: steps of at most 0.4 s; remembers the force of each."""
+
+    def __init__(self):
+        self.time, self.steps, self.gravity = 0.0, 0, (0.0, 0.0, 0.0)
+        self.forces = []
+
+    def step(self, remaining):
+        self.forces.append(self.gravity)
+        self.time += min(0.4, remaining)
+        self.steps += 1
+
+
+def test_a_changing_force_is_set_anew_before_each_step():
+    clock = Clock()
+    assert list(watched(clock, [0.6, 1.0], Report(lambda f: None), 0.0, 1.0, lambda t: -t)) == [
+        0,
+        1,
+    ]
+    assert [z for _, _, z in clock.forces] == pytest.approx([0.0, -0.4, -0.6])
 
 
 def test_a_compared_row_carries_the_relative_difference_and_units():
