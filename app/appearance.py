@@ -22,6 +22,8 @@ SPEED_COLOURS = (
 lightness rises evenly, so that equal differences of speed look equal."""
 
 WALL_COLOUR = (0xE0, 0x98, 0x90, 0x2A)
+TOOL_COLOUR = (0xC8, 0xD2, 0xDC, 0xFF)
+WOUND_COLOUR = (0xFF, 0xE0, 0x60, 0xFF)
 """Red, green, blue, opacity."""
 BACKGROUND = (14, 16, 20)
 FIELD_OF_VIEW = math.radians(55.0)

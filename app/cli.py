@@ -1,5 +1,6 @@
 """The command line: it parses and wires, and turns errors into one sentence and an exit code."""
 
+import math
 import os
 import signal
 import sys
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 EPILOG = "All quantities are in SI units. Exit codes: 0 done, 1 the run diverged, 2 wrong input."
 LIVE_PORT = 9876
+CONTROL_PORT = 8080
 
 arch_option = click.option(
     "--arch",
@@ -159,6 +161,35 @@ def cli() -> None:
 @click.option(
     "--resume", type=output_path, metavar="FILE", help="Go on from a checkpoint of the same run."
 )
+@click.option(
+    "--script",
+    type=output_path,
+    metavar="FILE",
+    help='Commands at simulated times, JSON lines: {"at": 0.5, "command": "wound", ...}.',
+)
+@click.option(
+    "--session",
+    type=output_path,
+    metavar="FILE",
+    help="Keep what is done to the run, for `replay`.  [default with --control: "
+    "SCENE.session.jsonl]",
+)
+@click.option(
+    "--control",
+    is_flag=False,
+    flag_value=str(CONTROL_PORT),
+    type=click.IntRange(1, 65534),
+    metavar="[PORT]",
+    help="Serve a page to act on the run at a port, and the same as JSON lines at the next one; "
+    f"runs until stopped or --until.  [default port: {CONTROL_PORT}]",
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Where the JSON lines of --control are served; other than loopback asks for a token in "
+    "VESSELFLOW_TOKEN, and leaves the page out.",
+)
 def run(
     scene_name: str,
     frames: int | None,
@@ -178,6 +209,10 @@ def run(
     seed: int,
     checkpoint: int | None,
     resume: Path | None,
+    script: Path | None,
+    session: Path | None,
+    control: int | None,
+    host: str,
 ) -> int:
     """Simulate a scene."""
     from app.output import check_output, write_json
@@ -193,7 +228,8 @@ def run(
         check_output(summary, "--summary", b"{")
     if rrd is None and live is None and every > 1:
         raise InputError("--every: nothing is shown without --rrd or --live")
-    if weights is not None and model != "pcnet":
+    acted_on = script is not None or session is not None or control is not None
+    if weights is not None and model != "pcnet" and not acted_on:
         raise InputError("--weights: only --model pcnet has weights")
     if (resume is not None or checkpoint is not None) and model == "auto":
         raise InputError("--checkpoint and --resume: name the model, for auto may choose another")
@@ -202,15 +238,25 @@ def run(
     kept = resume or Path(f"{scene.name}.checkpoint.npz")
     if checkpoint is not None:
         check_output(kept, "--checkpoint", b"PK")
+    if acted_on and model == "auto":
+        raise InputError("--model auto: pours a scene first; in a session, switch to auto instead")
+    if control is not None:
+        session = session or Path(f"{scene.name}.session.jsonl")
+        end = until or (frames * scene.frame_interval if frames else math.inf)
+    if session is not None:
+        check_output(session, "--session", b'{"format": "vesselflow session')
     asked = click.get_current_context().get_parameter_source("error")
     if asked is not click.core.ParameterSource.DEFAULT and model != "auto":
         raise InputError("--error: only --model auto has a budget")
 
     import hashlib
+    import importlib.util
 
+    from app.channel import Channel
     from app.checkpoint import Checkpoint, Checkpointer
     from app.drive import Observer, drive
     from app.models import maker_of
+    from app.page import ControlPage
     from app.progress import Progress
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
@@ -228,6 +274,8 @@ def run(
         "scene": scene.name, "scene_text": scene.text, "particles": particles, "height": height,
         "model": model, "arch": arch, "precision": precision, "seed": seed, "version": version(),
     }  # fmt: skip
+    if script is not None:
+        facts["script"] = script.read_text(errors="replace") if script.is_file() else ""
     if model == "pcnet":
         content = (weights or weights_for(scene)).read_bytes()
         facts["weights"] = hashlib.sha256(content).hexdigest()
@@ -236,9 +284,18 @@ def run(
         begun.require(facts, resume)
     start(arch, precision, threads, random_seed=seed)
     simulation = Simulation.from_scene(scene, maker, seed)
-    if begun is not None:
-        simulation.go_on_from(begun.state)
     observers: list[Observer] = []
+    acting = None
+    if acted_on:
+        from app.session import open_session
+
+        acting = open_session(
+            simulation, weights, script, session, begun, facts | {"checkpoint": checkpoint},
+            control is not None,
+        )  # fmt: skip
+        observers.append(acting)
+    elif begun is not None:
+        simulation.go_on_from(begun.state)
     if checkpoint is not None:
         observers.append(Checkpointer(kept, checkpoint, facts))
     if rrd is not None or live is not None:
@@ -249,10 +306,30 @@ def run(
         observers.append(view)
         if view.live:
             click.echo(f"live view: rerun --connect {view.live.url}", err=True)
-    outcome = drive(
-        simulation, observers, end, scene.frame_interval, Progress(end, scene.name),
-        begun.frame if begun else 0,
-    )  # fmt: skip
+        if acting:
+            acting.notes.append(view.note)
+    doors: list[Channel | ControlPage] = []
+    if acting is not None and control is not None:
+        doors.append(Channel(acting, host, control + 1, os.environ.get("VESSELFLOW_TOKEN")))
+        click.echo(f"commands as JSON lines: {host}:{control + 1}", err=True)
+        try:
+            page = ControlPage(acting, port=control)
+        except InputError as problem:
+            if importlib.util.find_spec("viser") is not None:
+                raise
+            click.echo(str(problem), err=True)
+        else:
+            doors.append(page)
+            acting.refusals.append(page.tell)
+            click.echo(f"page: {page.url}", err=True)
+    try:
+        outcome = drive(
+            simulation, observers, end, scene.frame_interval, Progress(end, scene.name),
+            begun.frame if begun else 0, acting.before_step if acting else None,
+        )  # fmt: skip
+    finally:
+        for door in doors:
+            door.close()
     click.echo(summary_text(outcome.summary))
     if rrd is not None and not isinstance(outcome.error, OSError):
         click.echo(
@@ -263,6 +340,24 @@ def run(
     if outcome.error:
         raise outcome.error
     return 128 + outcome.signal if outcome.signal else 0
+
+
+@cli.command()
+@click.argument("session", type=output_path)
+@click.option("--rrd", type=output_path, metavar="FILE", help="Record to a Rerun file.")
+@threads_option
+def replay(session: Path, rrd: Path | None, threads: int | None) -> int:
+    """Run a session again from its log, and compare the blood bit by bit, frame by frame."""
+    from app.output import check_output
+    from app.session import run_again
+
+    if rrd is not None:
+        check_output(rrd, "--rrd", b"RRF2")
+    kept, compared, difference = run_again(session, rrd, threads)
+    if difference is not None:
+        raise RunError(f"replay {session}: differs from frame {difference} on")
+    click.echo(f"{session}: {compared} frames, {len(kept.entries)} commands, the same bit by bit")
+    return 0
 
 
 def summary_text(summary: "Summary") -> str:
@@ -497,7 +592,10 @@ def validate(
 @click.option("--start-up", is_flag=True, help="Measure the time to the first frame.")
 @click.option("--split", is_flag=True, help="Measure each pass of a step beside its limits.")
 @click.option("--real-time", is_flag=True, help="How much blood holds real time, over flow speed.")
-@click.option("--plot", type=output_path, metavar="FOLDER", help="Draw the last two there.")
+@click.option("--control", is_flag=True, help="Measure what live control and view cost a run.")
+@click.option(
+    "--plot", type=output_path, metavar="FOLDER", help="Draw --split and --real-time there."
+)
 @click.option(
     "--json", "json_file", type=output_path, metavar="FILE", help="Write figures as JSON."
 )
@@ -511,6 +609,7 @@ def bench(
     start_up: bool,
     split: bool,
     real_time: bool,
+    control: bool,
     plot: Path | None,
     json_file: Path | None,
 ) -> int:
@@ -525,8 +624,9 @@ def bench(
     if not scenes:
         scenes = [(scene_path(name), count) for name in "AB" for count in (16000, 32000)]
     return benchmark.main(
-        scenes, until, arch, threads, peer, scale, start_up, split, real_time, plot, json_file
-    )
+        scenes, until, arch, threads, peer, scale, start_up, split, real_time, control, plot,
+        json_file,
+    )  # fmt: skip
 
 
 @cli.command()

@@ -5,7 +5,7 @@ import signal
 import statistics
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from types import FrameType
@@ -138,6 +138,7 @@ def drive(
     frame_interval: float,
     progress: Progress | None = None,
     frame: int = 0,
+    before_step: Callable[[], None] | None = None,
 ) -> Outcome:
     """Run a simulation to a time, showing every frame to every observer.
 
@@ -148,6 +149,7 @@ def drive(
         frame_interval: simulated time between frames [s].
         progress: where the state of the run is shown; nowhere if None.
         frame: number of the first frame.
+        before_step: called before each step; an empty vessel then ends nothing.
 
     Returns:
         the summary; with the error of a run that diverged or could not write its output, or the
@@ -171,11 +173,16 @@ def drive(
                     observer.on_frame(simulation, frame, figures)
                 if progress:
                     progress.show(figures.time, simulation.steps, figures.leaks)
-                if figures.time >= until or figures.particles == 0:
+                empty = figures.particles == 0 and before_step is None
+                if figures.time >= until or empty:
                     break
                 before = time.perf_counter()
                 with signals.interruptible():
-                    simulation.advance_to(frame_time(frame + 1, frame_interval, until))
+                    end = frame_time(frame + 1, frame_interval, until)
+                    if before_step is None:
+                        simulation.advance_to(end)
+                    else:
+                        simulation.advance_to(end, before_step)
                 took = time.perf_counter() - before
                 if simulation.steps > steps:
                     step_times.append(took / (simulation.steps - steps))

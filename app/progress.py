@@ -1,5 +1,6 @@
 """How far a run is: a bar on a terminal, now and then a line elsewhere."""
 
+import math
 import sys
 import time
 
@@ -25,7 +26,7 @@ class Progress:
     """Simulated time, real-time factor and time left, on stderr."""
 
     def __init__(self, until: float, title: str, console: Console | None = None):
-        """Show a run to a simulated time [s]."""
+        """Show a run to a simulated time [s], which may be infinite."""
         self.until = until
         self._console = console or Console(file=sys.stderr)
         self._reference: tuple[float, float] | None = None
@@ -39,7 +40,9 @@ class Progress:
                 TimeElapsedColumn(),
                 console=self._console,
             )
-            self._task = self._bar.add_task(title, total=until, state="compiling")
+            self._task = self._bar.add_task(
+                title, total=until if math.isfinite(until) else None, state="compiling"
+            )
             self._bar.start()
 
     def rate(self, simulated: float, now: float) -> float | None:
@@ -55,10 +58,12 @@ class Progress:
         """Show a frame: simulated time [s], steps so far, leaks."""
         now = time.perf_counter()
         rate = self.rate(simulated, now)
-        state = f"{simulated:.4f} of {self.until:.4g} s, {steps} steps"
+        ends = math.isfinite(self.until)
+        state = f"{simulated:.4f} {f'of {self.until:.4g} ' if ends else ''}s, {steps} steps"
         if rate:
-            left = duration((self.until - simulated) / rate)
-            state += f", {rate:.3g} x real time, {left} left"
+            state += f", {rate:.3g} x real time"
+        if rate and ends:
+            state += f", {duration((self.until - simulated) / rate)} left"
         if leaks:
             state += f", {leaks} leaks"
         if self._bar:

@@ -22,7 +22,9 @@ import rerun.blueprint as rrb
 
 from app.appearance import (
     BACKGROUND,
+    TOOL_COLOUR,
     WALL_COLOUR,
+    WOUND_COLOUR,
     eye,
     speed_colours,
     upward,
@@ -59,7 +61,16 @@ PLOTS: dict[str, tuple[str, tuple[tuple[str, tuple[int, int, int]], ...]]] = {
         "compression [%]",
         (("99th percentile", (120, 200, 255)), ("largest", (70, 110, 160))),
     ),
-    "volume": ("blood [ml]", (("in the vessel", (214, 43, 22)), ("drained", (150, 150, 170)))),
+    "volume": (
+        "blood [ml]",
+        (
+            ("in the vessel", (214, 43, 22)),
+            ("drained", (150, 150, 170)),
+            ("driven in", (110, 170, 255)),
+            ("bled", (255, 170, 77)),
+            ("sucked away", (140, 220, 140)),
+        ),
+    ),
     "wall": (
         "wall",
         (("leaks", (255, 90, 200)), ("corrections since the start", (160, 130, 255))),
@@ -253,6 +264,7 @@ class RerunView:
         # Free fall over the whole height: little is faster.
         self.full_scale = simulation.derived.expected_speed or 1.0
         self._last: tuple[int, float] = (-1, 0.0)
+        self._notes: Items = []
         blueprint = self._blueprint(simulation)
         identity = str(uuid.uuid4())
         self._writer: FileWriter | None = None
@@ -380,6 +392,17 @@ class RerunView:
                 ),
                 static=True,
             )
+        shape = simulation.surgery.tool.shape
+        if shape is not None:
+            stream.log(
+                "world/tool/shape",
+                rr.Mesh3D(
+                    vertex_positions=shape.vertices,
+                    triangle_indices=shape.faces,
+                    albedo_factor=TOOL_COLOUR,
+                ),
+                static=True,
+            )
         for entity, (_, lines) in PLOTS.items():
             stream.log(
                 f"plots/{entity}",
@@ -407,17 +430,30 @@ class RerunView:
         Raises:
             OSError: the recording cannot be written any more.
         """
-        items: Items = []
+        items, self._notes = self._notes, []
         if frame % self.every == 0:
             colours, _ = speed_colours(simulation.velocities(), self.full_scale)
             points = rr.Points3D(simulation.positions(), colors=colours, radii=self._radius)
             items.append(("world/blood", points))
+            items += self._surgery(simulation)
         in_vessel = figures.particles / max(1, simulation.derived.blood_particles) * self._volume
         for entity, values in (
             ("speed", [figures.max_speed]),
             ("energy", [1e3 * figures.kinetic_energy]),
             ("compression", [1e2 * figures.compression_p99, 1e2 * figures.compression_max]),
-            ("volume", [1e6 * in_vessel, 1e6 * figures.drained_volume]),
+            (
+                "volume",
+                [
+                    1e6 * volume
+                    for volume in (
+                        in_vessel,
+                        figures.drained_volume,
+                        figures.added_volume,
+                        figures.bled_volume,
+                        figures.sucked_volume,
+                    )
+                ],
+            ),
             ("wall", [figures.leaks, figures.wall_corrections]),
             ("step", [1e3 * figures.step]),
             ("guard", [1e2 * figures.fallback_share]),
@@ -429,6 +465,34 @@ class RerunView:
             _send(self._file, frame, figures.time, items)
         if self.live:
             self.live.offer(frame, figures.time, items)
+
+    def _surgery(self, simulation: "Simulation") -> Items:
+        """Drops outside, open wounds and the tool."""
+        surgery = simulation.surgery
+        items: Items = []
+        if surgery.wounds:
+            drops = rr.Points3D(simulation.drops(), colors=[[150, 20, 20]], radii=self._radius)
+            items.append(("world/drops", drops))
+            rims = rr.LineStrips3D(
+                [w.rim() for w in surgery.wounds if w.is_open],
+                radii=0.3 * self._radius,
+                colors=[WOUND_COLOUR],
+            )
+            items.append(("world/wounds", rims))
+        tool = surgery.tool
+        if tool.shape is not None:
+            pose = rr.Transform3D(
+                translation=tool.position, quaternion=rr.Quaternion(xyzw=tool.rotation.as_quat())
+            )
+            items.append(("world/tool", pose))
+        elif surgery.suction_rate > 0.0:
+            tip = rr.Points3D([tool.position], radii=surgery.suction_radius, colors=[TOOL_COLOUR])
+            items.append(("world/tool", tip))
+        return items
+
+    def note(self, text: str) -> None:
+        """Keep a sentence in the log, at the time of the frame that is under way."""
+        self._notes.append(("log", rr.TextLog(text, level=rr.TextLogLevel.INFO)))
 
     def close(self, ending: str) -> None:
         """Say how the run ended and finish the file.

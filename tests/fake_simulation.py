@@ -46,6 +46,8 @@ class FakeSimulation:
         self.start = random.uniform(low, high, (particles, 3))
         self.velocity = np.zeros((particles, 3), np.float32)
         self.velocity[:, 2] = -np.linspace(0.0, 1.0, particles)
+        tool = SimpleNamespace(shape=None, position=np.zeros(3))
+        self.surgery = SimpleNamespace(wounds=[], tool=tool, suction_rate=0.0)
 
     def advance_to(self, time: float) -> None:
         clock.sleep(self.pause)

@@ -1,0 +1,59 @@
+"""A surgery simulator's loop in small: blood, a wound, a tool's force, a clamp.
+
+    python docs/engine.py SCENE [SECONDS]
+
+Every frame it asks for what an engine draws and feels, into arrays that it owns.
+"""
+
+import sys
+
+import numpy as np
+
+from app.models import maker_of
+from app.scenes import find_scene
+from taichi_sph import Simulation, start
+from taichi_sph.runtime import number
+
+scene = find_scene(sys.argv[1])
+seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 0.2
+start(arch="cpu")
+simulation = Simulation.from_scene(scene, maker_of("pcnet", scene))
+physics = simulation.model_of(maker_of("physics", scene))
+simulation.rehearse([simulation.model, physics])  # compile now, not when it is needed
+
+room = simulation.particles.capacity
+identity = np.zeros(room, np.int32)
+position, velocity = np.zeros((2, room, 3), number())
+
+# A place on the wall half way along, and one inside for the tool.
+vertices = simulation.vessel.vertices
+wall = vertices[np.argmin(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1))]
+radius = 2.5 * scene.discretization.spacing
+
+before = simulation.diagnostics()
+frame_interval = scene.frame_interval
+for frame in range(1, round(seconds / frame_interval) + 1):
+    if frame == 3:
+        simulation.wound(wall, radius)
+        simulation.move_tool(wall)
+        simulation.suck(rate=1e-6)  # m^3/s
+    if frame == 8:
+        simulation.clamp()
+        simulation.suck(rate=0.0)
+    simulation.advance_to(frame * frame_interval)
+    count = simulation.particles.copy_to(identity, position, velocity)
+    # Draw position[:count], colour by velocity[:count], follow particles by identity[:count],
+    # draw simulation.drops() outside; feed the hand with the force:
+    force = simulation.take_force()
+    figures = simulation.diagnostics()
+    events = {
+        "bled": figures.bled_volume - before.bled_volume,
+        "sucked": figures.sucked_volume - before.sucked_volume,
+        "drained": figures.drained_volume - before.drained_volume,
+    }
+    before = figures
+    happened = ", ".join(f"{name} {1e9 * volume:.2f} ul" for name, volume in events.items())
+    print(
+        f"{figures.time:.3f} s: {count} particles, fastest {figures.max_speed:.2f} m/s, "
+        f"{happened}, force {1e3 * np.linalg.norm(force):.2f} mN"
+    )
