@@ -375,6 +375,7 @@ def main(
     start_up: bool = False,
     split: bool = False,
     real_time: bool = False,
+    control: bool = False,
     plot: Path | None = None,
     json_file: Path | None = None,
 ) -> int:
@@ -471,12 +472,26 @@ def main(
         terminal.print(realtime.curves_table(curves))
         if plot is not None:
             realtime.draw(curves, plot / "real_time.png")
+    overheads: list[Any] = []
+    if control:
+        from app.overhead import measure_overhead, overhead_table
+
+        for path in paths:
+            scene = read_scene(path)
+            with tempfile.TemporaryDirectory() as folder:
+                overheads.append(
+                    in_own_process(
+                        measure_overhead, scene, weights_for(scene), arch, threads, Path(folder)
+                    )
+                )
+        terminal.print(overhead_table(overheads))
     if json_file:
         result = {"machine": machine, "table": [asdict(p) for p in pairs]}
         result |= {"rows": [asdict(r) for r in rows], "starts": starts}
         result |= {"passes": [asdict(p) for p in passes]}
         result |= {"limits": asdict(limits) if split else {}}
         result |= {"real_time": [asdict(curve) for curve in curves]}
+        result |= {"control": [asdict(row) for row in overheads]}
         write_json(json_file, result)
     return 0
 

@@ -15,6 +15,7 @@ ONLY_IN = {
     "rerun": {"app/view.py"},
     "torch": {"nn/train.py"},
     "click": {"app/cli.py"},
+    "viser": {"app/page.py"},
 }
 FILES = sorted(f for package in PACKAGES for f in (ROOT / package).rglob("*.py"))
 assert FILES, "no source files found"
