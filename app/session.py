@@ -120,6 +120,7 @@ class Session:
         self.paused = False
         self.speed: float | None = None
         self.auto = False
+        self._auto_until = self._auto_time = self._stood_in = 0.0
         self._single = False
         self._pace = (0.0, 0.0)
         self.latency = 0.0
@@ -222,9 +223,11 @@ class Session:
         if self._single:
             self._single, self.paused = False, True
             return
-        if self.paused and self.watched:
-            self._take_picture()
         while self.paused and not self._single:
+            if self.watched and (
+                self._picture is None or self._picture.time != self.simulation.time
+            ):
+                self._take_picture()
             clock.sleep(WAIT)
             self._drain(held=True)
         began, at = self._pace
@@ -307,6 +310,7 @@ class Session:
             simulation.drive(command.factor, command.opening)
         elif isinstance(command, Model):
             self.auto = command.name == "auto"
+            self._auto_until, self._auto_time, self._stood_in = simulation.time, 0.0, 0.0
             simulation.switch(self.models["pcnet" if self.auto else command.name])
         elif isinstance(command, Tool):
             low, high = simulation.bounds
@@ -355,7 +359,7 @@ class Session:
             "suctioned": figures.sucked_volume,
             "added": figures.added_volume,
             "compression": figures.compression_p99,
-            "guard_share": figures.fallback_share,
+            "guard_share": self._guard_share(figures),
             "model": "auto" if self.auto else simulation.model.name,
             "gravity": list(simulation.gravity),
             "suction": surgery.suction_rate,
@@ -373,6 +377,15 @@ class Session:
             self._choose("implicit")
         elif self.auto and figures.compression_p99 < DENSE_NO_MORE:
             self._choose("pcnet")
+
+    def _guard_share(self, figures: "Diagnostics") -> float:
+        """Part of the time in which something else stood in for the network."""
+        if not self.auto:
+            return figures.fallback_share
+        passed, self._auto_until = figures.time - self._auto_until, figures.time
+        self._auto_time += passed
+        self._stood_in += passed * (self.simulation.model.name != "pcnet")
+        return self._stood_in / self._auto_time if self._auto_time > 0.0 else 0.0
 
     def _choose(self, name: str) -> None:
         if self.simulation.model.name != name:

@@ -214,7 +214,10 @@ def force_on_tool(
     pressure_term: ti.template(),
     viscosity: ti.template(),
 ) -> ti.math.vec3:
-    """F = -m sum_i sum_k a_ik over the proxies of the tool [N], a_ik as in `sum_acceleration`."""
+    """F = -m sum_i sum_k a_ik over the proxies of the tool [N], a_ik as in `sum_acceleration`.
+
+    m is the blood that a particle stands for.
+    """
     force = ti.Vector([0.0, 0.0, 0.0])
     for i in range(p.count[None]):
         for n in range(nb.wall_count[i]):
@@ -224,7 +227,7 @@ def force_on_tool(
                 force -= from_proxy(
                     w, k, r_ik, p.velocity[i], p.density[i], pressure_term[i], viscosity[i], fluid
                 )
-    return ti.static(fluid.calibration.mass * fluid.state.rest_density) * force
+    return ti.static(p.mass * fluid.state.rest_density) * force
 
 
 @ti.kernel

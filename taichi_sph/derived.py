@@ -35,9 +35,10 @@ class Derived:
 def expected_speed(scene: Scene, vessel: Vessel) -> float:
     """Largest speed that the scene's drive can give blood [m/s].
 
-    Of a free fall through the whole lumen and, where openings are driven, of a jet into the open
-    under the highest pressure, sqrt(2 (g H + p/rho)), or of a parabolic profile of all that flows,
-    2 Q/A, in the narrowest place, whichever is more.
+    Of a free fall through the whole lumen and, where openings are driven, of a jet under the
+    difference of the highest and the lowest pressure, that outside among them,
+    sqrt(2 (g H + p/rho)), or of a parabolic profile of all that flows, 2 Q/A, in the narrowest
+    place, whichever is more.
     """
     gravity = np.asarray(scene.gravity)
     g = float(np.linalg.norm(gravity))
@@ -45,13 +46,15 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
     if g > 0.0:
         along = vessel.vertices @ (gravity / g)
         head = g * float(along.max() - along.min())
-    pressure = flow = 0.0
+    highest = lowest = flow = 0.0
     for table in scene.openings.values():
         if table.driven:
             wave = read_waveform(table.waveform, Path(scene.folder)).factor
-            pressure = max(pressure, float((wave * (table.pressure or 0.0)).max()))
+            pressure = wave * (table.pressure or 0.0)
+            highest = max(highest, float(pressure.max()))
+            lowest = min(lowest, float(pressure.min()))
             flow += float(np.abs(wave * (table.flow or 0.0)).max())
-    jet = math.sqrt(2.0 * (head + pressure / scene.blood.density))
+    jet = math.sqrt(2.0 * (head + (highest - lowest) / scene.blood.density))
     if flow > 0.0:
         return max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
     return jet

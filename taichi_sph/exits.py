@@ -56,6 +56,10 @@ class Exits:
         """Mark what has left, at a time [s]; the next build of the lists drops it."""
         mark_removed(particles, grid, self, time)
 
+    def take(self, particles: "ti.template", rows: np.ndarray, k: int) -> None:
+        """Have the live particles of these rows, bool (n,), leave by exit k."""
+        take_rows(particles, self, np.ascontiguousarray(rows, np.int32), k)
+
     def account(self) -> np.ndarray:
         """Particles that have left by each place, (count + 2,)."""
         return np.asarray(self.removed.to_numpy()[: self.count + 2])
@@ -101,6 +105,17 @@ def mark_removed(p: ti.template(), grid: ti.template(), exits: ti.template(), ti
                 if outside and p.identity[i] >= 0:
                     p.identity[i] = -2 - LOST
                     ti.atomic_add(exits.removed[LOST], 1)
+
+
+@ti.kernel
+def take_rows(
+    p: ti.template(), exits: ti.template(), rows: ti.types.ndarray(dtype=ti.i32, ndim=1), k: int
+):
+    """Writes: identity, removed."""
+    for i in range(rows.shape[0]):
+        if rows[i] == 1 and p.identity[i] >= 0:
+            p.identity[i] = -4 - k
+            ti.atomic_add(exits.removed[2 + k], 1)
 
 
 @ti.kernel

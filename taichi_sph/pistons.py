@@ -10,8 +10,8 @@ with A the plug's cross-section, M its mass and a_i what its neighbours in the v
 along the way in and without gravity: forces within the plug cancel.  Whatever blood is beyond the
 plane belongs to the plug, so that flow may turn.  The plug is made of columns of particles a
 spacing apart; a column that has moved on by a spacing gets another particle at its far end.  The
-columns are staggered, so that blood is added particle by particle and the account closes to within
-the volume of one.
+columns are staggered, so that blood is added particle by particle: what was added differs from the
+integral of u A by two particles at most, and those that are due since the lists were built.
 """
 
 import math
@@ -141,6 +141,13 @@ class Piston:
     def cross_section(self, spacing: float) -> float:
         """A [m^2]: what the columns take up."""
         return len(self.sites) * spacing**2
+
+    def bearing(self, spacing: float) -> float:
+        """What pressure acts on [m^2]: midway between the columns' area and the opening's.
+
+        Blood in the vessel also pushes on the plug beside the outermost columns.
+        """
+        return math.sqrt(self.cross_section(spacing) * self.opening.area)
 
 
 def plug_sites(rim: Floats, opening: Opening, spacing: float) -> Floats:
@@ -280,7 +287,8 @@ class Pistons:
                 orders[k] = 0.0, piston.flow * factor / area, 0.0, piston.speed
             elif piston.pressure is not None:
                 # p A/M, times the number of particles that M is of.
-                push = piston.pressure * factor * area / (self.density * self.spacing**3)
+                push = piston.pressure * factor * piston.bearing(self.spacing)
+                push /= self.density * self.spacing**3
                 orders[k] = 1.0, push, float(-np.dot(gravity, piston.opening.normal)), piston.speed
         drive_plugs(particles, self, orders, dt)
         for piston, order in zip(self.each, orders, strict=False):

@@ -207,6 +207,9 @@ class Simulation(Motion):
         particles.acceleration.fill(0.0)
         self.exits.removed.fill(0)
         self.added, self._next_identity = 0, len(position)
+        for piston in self.pistons:
+            piston.start_again()
+        self.surgery.start_again(0.0)
         self.time = self.last_step = self.fallback_time = 0.0
         self.steps = self.wall_corrections = 0
 
@@ -216,8 +219,6 @@ class Simulation(Motion):
         self.place(self._initial, np.zeros_like(self._initial))
         self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections = clock
         self.gravity = self.scene.gravity
-        for piston in self._pistons.each:
-            piston.start_again()
         self.surgery.start_again(self.time)
 
     def put(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
@@ -453,13 +454,13 @@ def make_pistons(scene: Scene, vessel: Vessel) -> list[Piston]:
 def make_tool(
     scene: Scene, vessel: Vessel, spacing: float, setback: float, kernel: WendlandC2
 ) -> Tool:
-    """The scene's tool or, without one, a point outside the column's opening.
+    """The scene's tool or, without one, a point just inside the column's opening.
 
     Raises:
         InputError: its surface cannot be used.
     """
     if scene.tool is None:
         opening = vessel.opening(scene.column.opening)
-        return Tool(None, opening.centre + opening.radius * opening.normal)
+        return Tool(None, opening.centre - opening.radius * opening.normal)
     shape = read_shape(scene.tool, Path(scene.folder), spacing, setback, kernel)
     return Tool(shape, np.array(scene.tool.position))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from taichi_sph.errors import InputError
@@ -11,7 +12,7 @@ from taichi_sph.exits import Exits, suck
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.particles import Particles
 from taichi_sph.smoothing_kernels import WendlandC2
-from taichi_sph.surface import Floats, plane_axes
+from taichi_sph.surface import Booleans, Floats, plane_axes
 from taichi_sph.tool import Tool
 from taichi_sph.vessel import Vessel
 from taichi_sph.wall import Wall, refreshed_volumes
@@ -45,6 +46,10 @@ class Wound:
     """Unit normal out of the lumen."""
     radius: float
     """Of the puncture, half the width of the cut [m]."""
+    lift: float = 0.0
+    """Blood has left by it when it is so far beyond its plane [m] ..."""
+    reach: float = 0.0
+    """... and no farther from its line than this [m]."""
     is_open: bool = True
 
     def distance(self, points: Floats) -> Floats:
@@ -113,6 +118,10 @@ class Surgery:
         if len(self.wounds) >= MOST_WOUNDS:
             raise InputError(f"wound: a session has at most {MOST_WOUNDS}")
         least = LEAST_RADIUS * self.spacing
+        low, high = self.vessel.bounds
+        most = 0.5 * float((high - low).min())
+        if radius > most:
+            raise InputError(f"wound: a radius of {radius:.3g} m is no wound; at most {most:.3g} m")
         if radius < least:
             raise InputError(
                 f"wound: a radius of {radius:.3g} m is less than {LEAST_RADIUS:g} spacings of the "
@@ -132,17 +141,46 @@ class Surgery:
         normal = normals.sum(axis=0)
         normal -= line * float(normal @ line) / max(float(line @ line), 1e-20)
         wound = Wound(places[0], places[1], normal / np.linalg.norm(normal), radius)
+        self._fit(wound)
         self.wounds.append(wound)
         self._cut(len(self.wounds) - 1)
         return wound
 
+    def _fit(self, wound: Wound) -> None:
+        """Choose where blood has left by a wound: outside, and nowhere that the lumen is too.
+
+        Raises:
+            InputError: branches lie too close to each other there.
+        """
+        d = self.spacing
+        first, second = plane_axes(wound.normal)
+        line = wound.end - wound.begin
+        widest = wound.radius + ASIDE * d
+        for lift in (OUTSIDE * d, (OUTSIDE + 0.5) * d, (OUTSIDE + 1.0) * d):
+            across = np.arange(-widest, widest + 0.5 * d, 0.5 * d)
+            up = np.arange(lift, widest, 0.5 * d)
+            a, b, c = (x.ravel() for x in np.meshgrid(across, across, up, indexing="ij"))
+            apart = a[:, None] * first + b[:, None] * second + c[:, None] * wound.normal
+            places = (wound.begin + apart, wound.begin + 0.5 * line + apart, wound.end + apart)
+            points = np.concatenate(places if line.any() else places[:1])
+            away = wound.distance(points - lift * wound.normal)
+            inside = away[self.vessel.contains(points)]
+            reach = min(widest, float(inside.min(initial=np.inf)) - 0.5 * d)
+            if reach >= wound.radius:
+                wound.lift, wound.reach = lift, reach
+                return
+        raise InputError(
+            "wound: another part of the lumen lies right outside the wall there, so that blood "
+            "would not get out; choose another place"
+        )
+
     def _cut(self, number: int) -> None:
         """Let blood leave by a wound, and make the wall anew."""
         wound = self.wounds[number]
-        lift = OUTSIDE * self.spacing * wound.normal
+        lift = wound.lift * wound.normal
         self.exits.open(
             self.first_exit + number, wound.begin + lift, wound.end + lift, wound.normal,
-            wound.radius + ASIDE * self.spacing, drips=True,
+            wound.reach, drips=True,
         )  # fmt: skip
         self._make_wall()
 
@@ -158,15 +196,31 @@ class Surgery:
         wound, k = self.wounds[number], self.first_exit + number
         if not wound.is_open:
             return
-        wound.is_open = False
-        lift = -SEATED * self.spacing * wound.normal
-        self.exits.open(
-            k, wound.begin + lift, wound.end + lift, wound.normal,
-            wound.radius + ASIDE * self.spacing, drips=True,
-        )  # fmt: skip
         self.exits.mark(particles, self.neighbors.grid, time)
         self.exits.shut(k)
+        position, normal, _ = self._intact
+        comes_back = self._hole(wound)
+        wound.is_open = False
+        for other in self.wounds:
+            if other.is_open:
+                comes_back &= ~self._hole(other)
+        if comes_back.any():
+            live = particles.position.to_numpy()[: particles.count[None]].astype(float)
+            feet = position - self.wall.setback * normal
+            away, nearest = cKDTree(feet).query(live)
+            height = ((live - feet[nearest]) * normal[nearest]).sum(axis=1)
+            # Blood before wall that stayed is seated as it is.
+            under = comes_back[nearest] & (height > -SEATED * self.spacing)
+            self.exits.take(particles, under & (away < ASIDE * self.spacing), k)
         self._make_wall()
+
+    def _hole(self, wound: Wound) -> Booleans:
+        """Which proxies of the whole wall a wound takes away, (m,)."""
+        position, normal, _ = self._intact
+        away = wound.distance(position - self.wall.setback * normal)
+        # Each proxy is the wall for half a spacing round it; across a thin vessel they stay.
+        hole = away < wound.radius + 0.5 * self.wall.spacing
+        return np.asarray(hole & (normal @ wound.normal > 0.0))
 
     def _make_wall(self) -> None:
         """The wall without the proxies of open wounds (paper, Eq. 3: the rim's volumes anew)."""
@@ -174,15 +228,12 @@ class Surgery:
         if len(position) == 0:
             return
         gone = np.zeros(len(position), bool)
-        near = np.zeros(len(position), bool)
         for wound in self.wounds:
             if wound.is_open:
-                away = wound.distance(position - self.wall.setback * normal)
-                # Each proxy is the wall for half a spacing round it.
-                hole = wound.radius + 0.5 * self.wall.spacing
-                # Proxies stand a setback behind the wall: those across a thin vessel must stay.
-                gone |= (away < hole) & (normal @ wound.normal > 0.0)
-                near |= away < hole + self.kernel.support_radius
+                gone |= self._hole(wound)
+        near = np.zeros(len(position), bool)
+        if gone.any():
+            near = cKDTree(position[gone]).query(position)[0] < self.kernel.support_radius
         left = ~gone
         volume = refreshed_volumes(position[left], volume[left], self.kernel, near[left])
         self.wall.given = position[left], normal[left], volume
@@ -206,16 +257,18 @@ class Surgery:
 
     def before_drift(self, dt: float) -> float:
         """Move the tool by a step of dt [s]; returns how far a proxy of it may have gone [m]."""
+        moved = not self.tool.at_rest
         self.tool.aim()
-        if self.tool.at_rest and not self.tool.moved:
+        if self.tool.at_rest and not moved:
             return 0.0
-        moved = self.tool.move(dt)
+        way = self.tool.move(dt)
         self.tool.place(self.wall, self.neighbors)
-        return moved
+        return way
 
     def start_again(self, time: float) -> None:
         """As at the start, at a time [s]."""
         tool, self.wounds = self.tool, []
+        self.exits.drop_count[None] = 0
         for number in range(MOST_WOUNDS):
             self.exits.shut(self.first_exit + number)
         self._make_wall()
@@ -228,7 +281,7 @@ class Surgery:
         tool = self.tool
         return {
             "wounds": [
-                [*map(float, (*w.begin, *w.end, *w.normal, w.radius)), w.is_open]
+                [*map(float, (*w.begin, *w.end, *w.normal, w.radius, w.lift, w.reach)), w.is_open]
                 for w in self.wounds
             ],
             "suction": [self.suction_rate, self.suction_radius, self._owed, self._sucked_until],
@@ -244,7 +297,15 @@ class Surgery:
     def go_on_from(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave."""
         self.wounds = [
-            Wound(np.array(row[0:3]), np.array(row[3:6]), np.array(row[6:9]), row[9], bool(row[10]))
+            Wound(
+                np.array(row[0:3]),
+                np.array(row[3:6]),
+                np.array(row[6:9]),
+                radius=row[9],
+                lift=row[10],
+                reach=row[11],
+                is_open=bool(row[12]),
+            )
             for row in state["wounds"]
         ]
         for number in range(MOST_WOUNDS):

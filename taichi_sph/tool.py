@@ -9,12 +9,13 @@ import taichi as ti
 from scipy.spatial.transform import Rotation
 
 from taichi_sph import wall_sampling
+from taichi_sph.errors import InputError
 from taichi_sph.neighbors import Neighbors
 from taichi_sph.openings import load_surface, require_manifold, require_outward
 from taichi_sph.runtime import number
 from taichi_sph.scene import ToolTable
 from taichi_sph.smoothing_kernels import WendlandC2
-from taichi_sph.surface import Booleans, Floats, Integers, Nearest, clean
+from taichi_sph.surface import Booleans, Floats, Integers, Nearest, clean, is_closed
 from taichi_sph.wall import Wall, proxy_volumes
 
 FOLLOWING = 0.01
@@ -73,18 +74,23 @@ def read_shape(
     vertices, faces = load_surface(path)
     vertices, faces = clean(vertices * table.scale, faces)
     require_manifold(vertices, faces, str(path))
+    if not is_closed(faces):
+        raise InputError(f"{path}: the tool's surface has holes; it must be closed")
     require_outward(vertices, faces, str(path))
     points, nearest = wall_sampling.even_points(vertices, faces, spacing, seed=0)
     outward = wall_sampling.normals_at(vertices, faces, points, nearest)
     position = points - setback * outward
-    return Shape(
-        position,
-        -outward,
-        proxy_volumes(position, kernel),
-        vertices,
-        faces,
+    shape = Shape(
+        position, -outward, proxy_volumes(position, kernel), vertices, faces,
         float(np.linalg.norm(position, axis=1).max()),
-    )
+    )  # fmt: skip
+    outside = int(shape.clear_of(position).sum())
+    if outside:
+        raise InputError(
+            f"{path}: the tool is thinner than {2.0 * setback:.3g} m in places ({outside} of "
+            f"{len(position)} proxies do not fit in it); make it thicker or the spacing smaller"
+        )
+    return shape
 
 
 class Tool:
@@ -107,8 +113,6 @@ class Tool:
         """[m/s]"""
         self.spin = np.zeros(3)
         """[rad/s]"""
-        self.moved = False
-        """Whether it moved in the last step."""
 
     @property
     def count(self) -> int:
@@ -138,7 +142,6 @@ class Tool:
 
     def move(self, dt: float) -> float:
         """Move by a step of dt [s]; returns how far a proxy may have gone [m]."""
-        self.moved = not self.at_rest
         self.position = self.position + dt * self.velocity
         radius = 0.0
         if self.spin.any():

@@ -64,8 +64,11 @@ def read_waveform(given: str | None, folder: Path) -> Waveform:
         return BUILT_IN[given]()
     path = folder / given
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            lines = [line for line in csv.reader(file) if line and not line[0].startswith("#")]
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            lines = [
+                (reader.line_num, line) for line in reader if line and not line[0].startswith("#")
+            ]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or "not a CSV file"
         built_in = ", ".join(BUILT_IN)
@@ -73,11 +76,11 @@ def read_waveform(given: str | None, folder: Path) -> Waveform:
             f"{path}: cannot read the waveform: {reason}; built in is {built_in}"
         ) from None
     rows = []
-    for number, line in enumerate(lines, 1):
+    for number, line in lines:
         try:
             time, factor = (float(cell) for cell in line)
         except ValueError:
-            if number == 1:
+            if (number, line) == lines[0]:
                 continue  # titles
             raise InputError(
                 f"{path}: row {number} is {','.join(line)[:60]!r}; allowed: time [s], factor"

@@ -192,9 +192,14 @@ def test_auto_leaves_pcnet_where_blood_is_denser_than_its_training_and_comes_bac
     session.offer({"command": "model", "name": "auto"}, "test")
     session.before_step()
     figures = simulation.diagnostics()
-    for compression, name in ((0.05, "physics"), (0.09, "implicit"), (0.05, "implicit")):
-        session.on_frame(simulation, 1, replace(figures, compression_p99=compression))
+    for k, (compression, name) in enumerate(
+        ((0.05, "physics"), (0.09, "implicit"), (0.05, "implicit")), 1
+    ):
+        time = simulation.time + 0.01 * k
+        session.on_frame(simulation, k, replace(figures, time=time, compression_p99=compression))
         assert simulation.model.name == name
+    # Neither of the two stands for pcnet by its name: all three frames count.
+    assert session.figures()["guard_share"] == pytest.approx(1.0)
 
 
 def test_a_script_that_cannot_be_done_ends_the_run(simulation, tmp_path):
