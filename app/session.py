@@ -220,9 +220,6 @@ class Session:
         self._drain()
         if self.watched and clock.perf_counter() > self._pictured + PICTURE_PERIOD:
             self._take_picture()
-        if self._single:
-            self._single, self.paused = False, True
-            return
         while self.paused and not self._single:
             if self.watched and (
                 self._picture is None or self._picture.time != self.simulation.time
@@ -230,6 +227,9 @@ class Session:
                 self._take_picture()
             clock.sleep(WAIT)
             self._drain(held=True)
+        if self._single:
+            self._single = False  # this one; the next is held
+            return
         began, at = self._pace
         while self.speed is not None and not self.paused:
             ahead = (self.simulation.time - at) / self.speed - (clock.perf_counter() - began)

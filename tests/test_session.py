@@ -156,6 +156,30 @@ def test_a_held_session_does_not_move_but_for_single_steps(session):
     assert not session.paused
 
 
+def test_a_step_that_is_asked_for_while_blood_is_held_is_one_step(session):
+    import threading
+    import time
+
+    simulation, seen = session.simulation, []
+    session.offer({"command": "pause"}, "test")
+
+    def act() -> None:
+        time.sleep(0.1)
+        session.offer({"command": "step"}, "test")
+        time.sleep(0.5)
+        seen.append(simulation.steps)
+        session.offer({"command": "pause", "on": False}, "test")
+
+    hand = threading.Thread(target=act)
+    steps = simulation.steps
+    hand.start()
+    for _ in range(2):
+        session.before_step()
+        simulation.step(1e-5)
+    hand.join()
+    assert seen == [steps + 1]
+
+
 def test_a_speed_limit_holds_blood_to_its_pace(session):
     import time
 

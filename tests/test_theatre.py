@@ -108,7 +108,7 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         wait_until(lambda: not surgery.wounds[0].is_open)
         browser.press("reset")
         wait_until(lambda: not surgery.wounds)
-        assert simulation.gravity == scene.gravity
+        wait_until(lambda: simulation.gravity == scene.gravity)
     finally:
         browser.driver.quit()
         page.close()
