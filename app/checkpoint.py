@@ -80,7 +80,7 @@ class Checkpoint:
         for name, wanted in facts.items():
             found = self.facts.get(name)
             if found != wanted:
-                plain = name not in ("scene_text", "weights")
+                plain = name not in ("scene_text", "weights", "script")
                 values = f": {found} there, {wanted} here" if plain else ""
                 raise InputError(
                     f"--resume {path}: is of another run, its {name.replace('_', ' ')} differs"

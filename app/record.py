@@ -173,7 +173,9 @@ def plan(
     for number, height in enumerate(heights):
         if not height > 0.0:
             raise InputError(f"--heights {height:g}: a height is greater than 0 m")
-        column = msgspec.structs.replace(scene.column, height=float(height), particles=None)
+        column = msgspec.structs.replace(
+            scene.column, height=float(height), particles=None, full=False
+        )
         blood = vessel.fill_column(column, scene.discretization.spacing)
         derived = derive(scene, vessel, len(blood), 0)
         facts = Facts(

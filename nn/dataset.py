@@ -584,7 +584,9 @@ class Run:
         """
         facts = self.facts
         scene = parse_scene(facts.scene, self._where, Path(facts.scene_folder), facts.scene_name)
-        column = msgspec.structs.replace(scene.column, height=facts.height, particles=None)
+        column = msgspec.structs.replace(
+            scene.column, height=facts.height, particles=None, full=False
+        )
         return msgspec.structs.replace(scene, column=column)
 
     @property

@@ -6,6 +6,7 @@ import taichi as ti
 from nn.dataset import State, Substeps
 from nn.features import GATHERED, FeatureScales, extract
 from taichi_sph.acceleration import Fluid, SphAcceleration, sum_density
+from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 from taichi_sph.vessel import Vessel
@@ -23,7 +24,17 @@ class Stage(Simulation):
     physics: SphAcceleration
 
     def __init__(self, scene: Scene, vessel: Vessel, seed: int):
-        """As `Simulation`, by the physics and with no step longer than the scene's own."""
+        """As `Simulation`, by the physics and with no step longer than the scene's own.
+
+        Raises:
+            InputError: as `Simulation`, or blood is driven in, so that it does not stay the same.
+        """
+        for name, table in scene.openings.items():
+            if table.driven:
+                raise InputError(
+                    f"openings.{name}: is driven; only scenes whose blood stays the same can be "
+                    "recorded: take flow and pressure out"
+                )
         super().__init__(scene, vessel, self._make_model, seed)
         self.step_limit = self.derived.step
         self._taken: list[float] = []

@@ -311,18 +311,31 @@ class Browser:
         """The first element that an XPath names; waits for it."""
         return wait_until(lambda: self.driver.find_elements("xpath", path), 3 * PATIENCE)[0]
 
+    def act(self, path: str, deed: Callable[[Any], object]) -> None:
+        """Do something to an element; again where the page has drawn it anew meanwhile."""
+        from selenium.common.exceptions import StaleElementReferenceException
+
+        for _ in range(10):
+            try:
+                deed(self.find(path))
+                return
+            except StaleElementReferenceException:
+                time.sleep(0.1)
+        raise AssertionError(f"{path} is drawn anew again and again")
+
     def press(self, button: str) -> None:
-        self.find(f"//button[.='{button}']").click()
+        self.act(f"//button[.='{button}']", lambda found: found.click())
 
     def enter(self, label: str, value: float) -> None:
         from selenium.webdriver.common.keys import Keys
 
         path = f'//label[.="{label}"]/following::input[@inputmode="decimal"][1]'
-        self.find(path).send_keys(Keys.CONTROL, "a", Keys.NULL, str(value), Keys.TAB)
+        keys = (Keys.CONTROL, "a", Keys.NULL, str(value), Keys.TAB)
+        self.act(path, lambda found: found.send_keys(*keys))
 
     def choose(self, label: str, option: str) -> None:
-        self.find(f'//label[.="{label}"]/following::input[1]').click()
-        self.find(f"//*[@role='option'][.='{option}']").click()
+        self.act(f'//label[.="{label}"]/following::input[1]', lambda found: found.click())
+        self.act(f"//*[@role='option'][.='{option}']", lambda found: found.click())
 
     def pixel(self, point: np.ndarray) -> tuple[int, int]:
         """Where a point [m] is on the page, as long as the camera stands as at the start."""

@@ -359,3 +359,11 @@ def test_a_log_on_a_full_disk_ends_the_run_in_one_sentence(driven, tmp_path):
         tmp_path, "run", driven, "--session", "/dev/full", "--frames", 1, code=2
     )  # fmt: skip
     assert "No space left on device" in error.splitlines()[-1]
+
+
+def test_a_driven_scene_cannot_be_recorded_for_training(driven, tmp_path):
+    error = vesselflow(
+        tmp_path, "record", driven, "--heights", "0.01", "--frames", 1, "--out", "d.h5", code=2
+    )
+    assert "openings.top: is driven" in error.splitlines()[-1]
+    assert not (tmp_path / "d.h5").exists()
