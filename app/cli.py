@@ -1,5 +1,6 @@
 """The command line: it parses and wires, and turns errors into one sentence and an exit code."""
 
+import contextlib
 import math
 import os
 import signal
@@ -15,6 +16,7 @@ from taichi_sph.errors import InputError, RunError
 
 if TYPE_CHECKING:
     from app.drive import Summary
+    from app.session import Session
 
 EPILOG = "All quantities are in SI units. Exit codes: 0 done, 1 the run diverged, 2 wrong input."
 LIVE_PORT = 9876
@@ -188,7 +190,7 @@ def cli() -> None:
     default="127.0.0.1",
     show_default=True,
     help="Where the JSON lines of --control are served; other than loopback asks for a token in "
-    "VESSELFLOW_TOKEN, and leaves the page out.",
+    "VESSELFLOW_TOKEN; the page stays on loopback.",
 )
 def run(
     scene_name: str,
@@ -250,13 +252,10 @@ def run(
         raise InputError("--error: only --model auto has a budget")
 
     import hashlib
-    import importlib.util
 
-    from app.channel import Channel
     from app.checkpoint import Checkpoint, Checkpointer
     from app.drive import Observer, drive
     from app.models import maker_of
-    from app.page import ControlPage
     from app.progress import Progress
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
@@ -308,28 +307,13 @@ def run(
             click.echo(f"live view: rerun --connect {view.live.url}", err=True)
         if acting:
             acting.notes.append(view.note)
-    doors: list[Channel | ControlPage] = []
-    if acting is not None and control is not None:
-        doors.append(Channel(acting, host, control + 1, os.environ.get("VESSELFLOW_TOKEN")))
-        click.echo(f"commands as JSON lines: {host}:{control + 1}", err=True)
-        try:
-            page = ControlPage(acting, port=control)
-        except InputError as problem:
-            if importlib.util.find_spec("viser") is not None:
-                raise
-            click.echo(str(problem), err=True)
-        else:
-            doors.append(page)
-            acting.refusals.append(page.tell)
-            click.echo(f"page: {page.url}", err=True)
-    try:
+    with contextlib.ExitStack() as doors:
+        if acting is not None and control is not None:
+            open_doors(acting, control, host, doors)
         outcome = drive(
             simulation, observers, end, scene.frame_interval, Progress(end, scene.name),
             begun.frame if begun else 0, acting.before_step if acting else None,
         )  # fmt: skip
-    finally:
-        for door in doors:
-            door.close()
     click.echo(summary_text(outcome.summary))
     if rrd is not None and not isinstance(outcome.error, OSError):
         click.echo(
@@ -340,6 +324,32 @@ def run(
     if outcome.error:
         raise outcome.error
     return 128 + outcome.signal if outcome.signal else 0
+
+
+def open_doors(session: "Session", port: int, host: str, doors: contextlib.ExitStack) -> None:
+    """Serve the page at a port and the channel at the next, until `doors` are closed.
+
+    Raises:
+        InputError: a port is taken, or the host asks for a token.
+    """
+    import importlib.util
+
+    from app.channel import Channel
+    from app.page import ControlPage
+
+    channel = Channel(session, host, port + 1, os.environ.get("VESSELFLOW_TOKEN"))
+    doors.callback(channel.close)
+    click.echo(f"commands as JSON lines: {host}:{port + 1}", err=True)
+    try:
+        page = ControlPage(session, port=port)
+    except InputError as problem:
+        if importlib.util.find_spec("viser") is not None:
+            raise
+        click.echo(str(problem), err=True)
+        return
+    doors.callback(page.close)
+    session.refusals.append(page.tell)
+    click.echo(f"page: {page.url}", err=True)
 
 
 @cli.command()

@@ -179,10 +179,7 @@ def drive(
                 before = time.perf_counter()
                 with signals.interruptible():
                     end = frame_time(frame + 1, frame_interval, until)
-                    if before_step is None:
-                        simulation.advance_to(end)
-                    else:
-                        simulation.advance_to(end, before_step)
+                    simulation.advance_to(end, before_step)
                 took = time.perf_counter() - before
                 if simulation.steps > steps:
                     step_times.append(took / (simulation.steps - steps))

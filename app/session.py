@@ -34,6 +34,7 @@ from app.commands import (
 )
 from app.drive import Observer, drive
 from app.models import MODELS, maker_of
+from app.output import write_text
 from app.progress import Progress
 from app.scenes import weights_for, with_column
 from taichi_sph.errors import InputError, RunError
@@ -93,6 +94,7 @@ class Session:
         log: Path | None = None,
         facts: dict[str, Any] | None = None,
         script: Iterable[tuple[float, AnyCommand]] = (),
+        before: Iterable[dict[str, Any]] = (),
     ):
         """Make the models ready.
 
@@ -102,6 +104,7 @@ class Session:
             log: file for what is done.
             facts: what the run is of, for the log's head.
             script: simulated times [s] and commands, in any order.
+            before: lines that the log holds already, of a session that goes on.
 
         Raises:
             InputError: a model cannot be made, or the log cannot be written.
@@ -137,27 +140,23 @@ class Session:
         self._past: deque[tuple[float, float, float, float]] = deque(maxlen=AVERAGED)
         self._log = None
         if log is not None:
+            head = {"format": FORMAT, "facts": facts or {}}
             try:
-                self._log = log.open("w", encoding="utf-8")
+                # Whole or not at all: what it held must outlive a kill.
+                write_text(log, "".join(json.dumps(row) + "\n" for row in (head, *before)))
+                self._log = log.open("a", encoding="utf-8")
             except OSError as error:
                 raise InputError(f"{log}: cannot be written: {error.strerror}") from None
-            self._write({"format": FORMAT, "facts": facts or {}})
 
-    def go_on_from(self, state: "Snapshot", frame: int, kept: "Kept") -> None:
-        """Go on from a state of this session, at a frame; what came after it is done again.
-
-        The log is begun anew with what came before: killed at any moment, nothing is lost.
-        """
+    def go_on_from(self, state: "Snapshot", kept: "Kept") -> None:
+        """Go on from a state of this session; commands that came after it are done again."""
         simulation = self.simulation
         simulation.switch(self.models[state.controls["model"]])
         simulation.go_on_from(state)
-        before = [entry for entry in kept.entries if entry.step < state.steps]
-        for entry in before:
-            self._write(entry.line)
-            if isinstance(entry.command, Model) and entry.source != "auto":
-                self.auto = entry.command.name == "auto"
-        for k in sorted(k for k in kept.digests if k < frame):
-            self._write({"frame": k, "digest": kept.digests[k]})
+        for entry in kept.entries:
+            by_hand = isinstance(entry.command, Model) and entry.source != "auto"
+            if by_hand and entry.step < state.steps:
+                self.auto = entry.to_auto
         after = [entry for entry in kept.entries if entry.step >= state.steps]
         self.recorded = [e for e in after if e.source not in ("script", "auto") and not e.timeless]
         done_until = state.time - state.last_step
@@ -166,7 +165,7 @@ class Session:
     def replay(self, kept: "Kept") -> None:
         """Do again all that a log holds; `auto` chooses as it did."""
         self.recorded = [
-            Entry(e.step, e.source, Model(name="pcnet") if e.to_auto else e.command, e.line)
+            Entry(e.step, e.source, Model(name="pcnet") if e.to_auto else e.command)
             for e in kept.entries
             if not e.timeless
         ]
@@ -475,8 +474,6 @@ class Entry:
     """That it came before."""
     source: str
     command: AnyCommand
-    line: dict[str, Any]
-    """As it is in the log."""
 
     @property
     def timeless(self) -> bool:
@@ -497,6 +494,16 @@ class Kept:
     entries: list[Entry]
     digests: dict[int, str]
     """Of the blood, by frame."""
+    rows: list[dict[str, Any]]
+    """All lines but the head."""
+
+    def until(self, frame: int, step: int) -> list[dict[str, Any]]:
+        """Lines of what came before a frame and a step."""
+        return [
+            row
+            for row in self.rows
+            if ("do" in row and row["step"] < step) or ("frame" in row and row["frame"] < frame)
+        ]
 
 
 def read_session(path: Path, option: str) -> Kept:
@@ -517,6 +524,7 @@ def read_session(path: Path, option: str) -> Kept:
         ) from None
     entries: list[Entry] = []
     digests: dict[int, str] = {}
+    rows: list[dict[str, Any]] = []
     for number, line in enumerate(lines[1:], 2):
         try:
             row = json.loads(line)
@@ -524,14 +532,15 @@ def read_session(path: Path, option: str) -> Kept:
                 digests[int(row["frame"])] = str(row["digest"])
             elif "do" in row:
                 command = parse_command(row["do"])
-                entries.append(Entry(int(row["step"]), str(row["source"]), command, row))
+                entries.append(Entry(int(row["step"]), str(row["source"]), command))
+            rows.append(row)
         except (ValueError, KeyError, TypeError, InputError):
             if number == len(lines):
                 break  # cut while it was written
             raise InputError(f"{option} {path}: line {number} is no line of a session") from None
     if not digests:
         raise InputError(f"{option} {path}: holds no frame")
-    return Kept(facts, entries, digests)
+    return Kept(facts, entries, digests, rows)
 
 
 class Comparer:
@@ -584,7 +593,7 @@ def open_session(
     """
     scene = simulation.scene
     entries = read_script(script) if script is not None else []
-    kept = Kept({}, [], {})
+    kept = Kept({}, [], {}, [])
     if begun is not None and log is not None and log.is_file():
         kept = read_session(log, "--session")
     elif log is not None and log.is_file() and log.stat().st_size:
@@ -595,9 +604,10 @@ def open_session(
         names.add(begun.state.controls["model"])
     makers, network = _models(MODELS if all_models else names, scene, weights)
     head = {"folder": str(scene.folder), "models": list(makers), **network}
-    session = Session(simulation, makers, log, facts | head, entries)
+    before = kept.until(begun.frame, begun.state.steps) if begun is not None else []
+    session = Session(simulation, makers, log, facts | head, entries, before)
     if begun is not None:
-        session.go_on_from(begun.state, begun.frame, kept)
+        session.go_on_from(begun.state, kept)
     return session
 
 

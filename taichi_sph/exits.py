@@ -35,6 +35,8 @@ class Exits:
         """Blood farther than this from the line has not left by it [m]; 0 where shut."""
         self.drips = ti.field(int, rows)
         """Whether what leaves is remembered as drops."""
+        self.used = ti.field(int, ())
+        """No exit from this one on has ever been open."""
         self.removed = ti.field(int, rows + 2)
         self.drop_count = ti.field(int, ())
         self.drop_position = ti.Vector.field(3, float, MOST_DROPS)
@@ -47,6 +49,7 @@ class Exits:
         """Let blood leave by exit k; the meaning of the rest is that of the fields."""
         self.begin[k], self.end[k], self.normal[k] = begin, end, normal
         self.reach[k], self.drips[k] = reach, int(drips)
+        self.used[None] = max(self.used[None], k + 1)
 
     def shut(self, k: int) -> None:
         """Let no more blood leave by exit k."""
@@ -85,7 +88,7 @@ def mark_removed(p: ti.template(), grid: ti.template(), exits: ti.template(), ti
     """Mark blood beyond an exit, or out of the box.  Writes: identity, removed, drops."""
     for i in range(p.count[None]):
         x = p.position[i]
-        for k in range(exits.reach.shape[0]):
+        for k in range(exits.used[None]):
             if p.identity[i] >= 0 and exits.reach[k] > 0.0:
                 r = x - exits.begin[k]
                 line = exits.end[k] - exits.begin[k]

@@ -257,6 +257,8 @@ class Surgery:
 
     def before_drift(self, dt: float) -> float:
         """Move the tool by a step of dt [s]; returns how far a proxy of it may have gone [m]."""
+        if self.tool.settled:
+            return 0.0
         moved = not self.tool.at_rest
         self.tool.aim()
         if self.tool.at_rest and not moved:
@@ -267,11 +269,13 @@ class Surgery:
 
     def start_again(self, time: float) -> None:
         """As at the start, at a time [s]."""
-        tool, self.wounds = self.tool, []
+        tool, had = self.tool, len(self.wounds)
+        self.wounds = []
         self.exits.drop_count[None] = 0
-        for number in range(MOST_WOUNDS):
+        for number in range(had):
             self.exits.shut(self.first_exit + number)
-        self._make_wall()
+        if had:
+            self._make_wall()
         self.suction_rate, self._owed, self._sucked_until = 0.0, 0.0, time
         tool.start_again()
         tool.place(self.wall, self.neighbors)

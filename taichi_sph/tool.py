@@ -113,6 +113,7 @@ class Tool:
         """[m/s]"""
         self.spin = np.zeros(3)
         """[rad/s]"""
+        self._reached: tuple[object, object] = (None, None)
 
     @property
     def count(self) -> int:
@@ -124,6 +125,12 @@ class Tool:
         """Whether it stands still."""
         return not (self.velocity.any() or self.spin.any())
 
+    @property
+    def settled(self) -> bool:
+        """Whether it has come to rest where it is still wanted: most steps of most runs."""
+        wanted = self.wanted_position, self.wanted_rotation
+        return self._reached[0] is wanted[0] and self._reached[1] is wanted[1]
+
     def aim(self) -> None:
         """Choose the velocity for the next step."""
         away = self.wanted_position - self.position
@@ -131,6 +138,8 @@ class Tool:
         radius = self.shape.radius if self.shape else 0.0
         self.velocity = self._bounded(away, 1.0)
         self.spin = self._bounded(turn, radius)
+        if self.at_rest:
+            self._reached = self.wanted_position, self.wanted_rotation
 
     @staticmethod
     def _bounded(way: Floats, arm: float) -> Floats:

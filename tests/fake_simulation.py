@@ -6,6 +6,7 @@ says each frame's number on stdout.
 
 import sys
 import time as clock
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -49,7 +50,7 @@ class FakeSimulation:
         tool = SimpleNamespace(shape=None, position=np.zeros(3))
         self.surgery = SimpleNamespace(wounds=[], tool=tool, suction_rate=0.0)
 
-    def advance_to(self, time: float) -> None:
+    def advance_to(self, time: float, before_step: Callable[[], None] | None = None) -> None:
         clock.sleep(self.pause)
         if time > self.diverges_at:
             raise RunError("the run diverged: particle 3 is not finite")
