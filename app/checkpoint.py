@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics
     from taichi_sph.simulation import Simulation
 
-FORMAT = "vesselflow checkpoint 1"
+FORMAT = "vesselflow checkpoint 2"
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 import math
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 import trimesh
 
 from app.scenes import find_scene
-from taichi_sph.scene import Column, NewtonianTable, Scene, ToolTable
+from taichi_sph.scene import Column, NewtonianTable, Scene, ToolTable, WallTable
 from taichi_sph.simulation import Simulation
 from taichi_sph.surface import enclosed_volume
 from taichi_sph.tool import FOLLOWING
@@ -28,7 +28,7 @@ IN_A_TUBE = 5.97
 change = msgspec.structs.replace
 
 
-def _tube(spacing: float, top: dict[str, float], bottom: dict[str, float]) -> Scene:
+def _tube(spacing: float, top: dict[str, Any], bottom: dict[str, Any]) -> Scene:
     """The straight tube, full, without gravity, driven at its ends."""
     scene = find_scene("tube")
     return change(
@@ -96,6 +96,34 @@ def wound(report: "Report", quick: bool) -> None:
         "(error: the factor, less 1)",
         f"{6e7 * rate:.0f} ml/min", f"{6e7 * theory:.0f} ml/min",
         max(rate / theory, theory / max(rate, 1e-30)) - 1.0, 1.0,
+    )  # fmt: skip
+
+
+def pulse(report: "Report", quick: bool) -> None:
+    """A vessel shut at one end whose wall moves out and in: blood follows by the other end."""
+    swing, beat, pressure = 3e-4, 0.1, 600.0
+    spacing = 1e-3 if quick else 7e-4
+    scene = _tube(spacing, {"pressure": pressure}, {"state": "capped"})
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "beat.csv"
+        time = np.linspace(0.0, beat, 101)
+        level = 0.5 - 0.5 * np.cos(2.0 * math.pi * time / beat)
+        np.savetxt(file, np.stack([time, level], axis=1), delimiter=",")
+        blood = change(scene.blood, rheology=NewtonianTable(viscosity=0.02))
+        wall = WallTable(pulse=swing, waveform=str(file))
+        simulation = Simulation.from_scene(change(scene, wall=wall, blood=blood))
+    _watch(simulation, 1.5 * beat, report, 0.0, 0.75)
+    wide = len(simulation.identities())
+    _watch(simulation, 2.0 * beat, report, 0.75, 1.0)
+    moved = (wide - len(simulation.identities())) * spacing**3
+    top, bottom = simulation.vessel.openings
+    z = np.linspace(bottom.centre[2], top.centre[2], 2001)
+    share = np.clip((top.centre[2] - np.abs(z)) / top.radius, 0.0, 1.0)
+    radius = top.radius + swing * share**2 * (3.0 - 2.0 * share)
+    room = float(np.trapezoid(math.pi * (radius**2 - top.radius**2), z))
+    report.compare(
+        f"wall that moves out by {1e3 * swing:.1f} mm and back: blood driven out",
+        1e6 * moved, 1e6 * room, 0.1, "ml",
     )  # fmt: skip
 
 

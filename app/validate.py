@@ -613,6 +613,7 @@ CASES = (
     Case("casson", "Casson blood in a tube", "f32", casson),
     Case("dam_break", "dam break", "f32", dam_break),
     Case("account", "pump and reservoir", "f32", operations.account),
+    Case("pulse", "a wall that pulses", "f32", operations.pulse),
     Case("wound", "bleeding from a wound", "f32", operations.wound),
     Case("tool", "sphere in a tank", "f32", operations.tool),
 )

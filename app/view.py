@@ -265,6 +265,8 @@ class RerunView:
         self.full_scale = simulation.derived.expected_speed or 1.0
         self._last: tuple[int, float] = (-1, 0.0)
         self._notes: Items = []
+        self._wall: tuple[np.ndarray, np.ndarray] | None = None
+        """Vertices of a wall that pulses, and how far each moves [m]."""
         blueprint = self._blueprint(simulation)
         identity = str(uuid.uuid4())
         self._writer: FileWriter | None = None
@@ -365,12 +367,17 @@ class RerunView:
         used, faces = np.unique(faces, return_inverse=True)
         faces = faces.reshape(-1, 3)
         vertices = np.asarray(vessel.vertices, float)[used]
+        normals = vertex_normals(vertices, faces)
+        if simulation.pulse is not None:
+            reach = simulation.pulse.reach(vessel, vertices)
+            self._wall = vertices, reach[:, None] * normals
         stream.log(
             "world/vessel",
-            rr.Mesh3D(
-                vertex_positions=vertices,
+            rr.Mesh3D.from_fields(
+                # What is static hides what is logged with a time.
+                vertex_positions=vertices if simulation.pulse is None else None,
                 triangle_indices=faces,
-                vertex_normals=vertex_normals(vertices, faces),
+                vertex_normals=normals,
                 albedo_factor=list(WALL_COLOUR),
             ),
             static=True,
@@ -436,6 +443,10 @@ class RerunView:
             points = rr.Points3D(simulation.positions(), colors=colours, radii=self._radius)
             items.append(("world/blood", points))
             items += self._surgery(simulation)
+            if self._wall is not None:
+                narrow, way = self._wall
+                wall = narrow + simulation.wall.level * way
+                items.append(("world/vessel", rr.Mesh3D.from_fields(vertex_positions=wall)))
         in_vessel = figures.particles / max(1, simulation.derived.blood_particles) * self._volume
         for entity, values in (
             ("speed", [figures.max_speed]),

@@ -27,7 +27,7 @@ class Stage(Simulation):
         """As `Simulation`, by the physics and with no step longer than the scene's own.
 
         Raises:
-            InputError: as `Simulation`, or blood is driven in, so that it does not stay the same.
+            InputError: as `Simulation`, or a pump or the wall drives it, and not the blood alone.
         """
         for name, table in scene.openings.items():
             if table.driven:
@@ -35,6 +35,8 @@ class Stage(Simulation):
                     f"openings.{name}: is driven; only scenes whose blood stays the same can be "
                     "recorded: take flow and pressure out"
                 )
+        if scene.wall is not None:
+            raise InputError("wall: pulses; only scenes whose wall stands still can be recorded")
         super().__init__(scene, vessel, self._make_model, seed)
         self.step_limit = self.derived.step
         self._taken: list[float] = []

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from taichi_sph.pulse import read_pulse
 from taichi_sph.rheology import rheology_of
 from taichi_sph.scene import Scene
 from taichi_sph.vessel import Vessel
@@ -38,7 +39,8 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
     Of a free fall through the whole lumen and, where openings are driven, of a jet under the
     difference of the highest and the lowest pressure, that outside among them,
     sqrt(2 (g H + p/rho)), or of a parabolic profile of all that flows, 2 Q/A, in the narrowest
-    place, whichever is more.
+    place, whichever is more; and with a wall that pulses, beside either, of what it drives out
+    through all open openings.
     """
     gravity = np.asarray(scene.gravity)
     g = float(np.linalg.norm(gravity))
@@ -55,9 +57,15 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
             lowest = min(lowest, float(pressure.min()))
             flow += float(np.abs(wave * (table.flow or 0.0)).max())
     jet = math.sqrt(2.0 * (head + (highest - lowest) / scene.blood.density))
+    squeezed = 0.0
+    pulse = read_pulse(scene, vessel)
+    if pulse is not None:
+        area = sum(opening.area for opening in vessel.openings if opening.is_open)
+        speed = pulse.swing * pulse.fastest
+        squeezed = 2.0 * vessel.wall_area * speed / area if area else speed
     if flow > 0.0:
-        return max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
-    return jet
+        jet = max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
+    return jet + squeezed
 
 
 def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> Derived:

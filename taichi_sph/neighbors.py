@@ -2,7 +2,8 @@
 
 Blood is sorted by cell and, inside a cell, by identity, so that sums run in one order and two
 runs agree bitwise.  Lists hold what lies within R + skin when they are built and stay valid
-until some particle has moved half the skin; proxies never move and are sorted once.
+until some particle has moved half the skin.  Proxies are sorted once: where they pulse, by the
+middle of their way, and the cells are wider by half of it.
 """
 
 import math
@@ -258,7 +259,7 @@ class Neighbors:
         if wall.count == 0:
             return
         given = [np.asarray(a, dtype=number()) for a in wall.given]
-        x = given[0]
+        x = np.asarray(wall.given.at(0.5), dtype=number())
         c = np.floor((x - np.asarray(self.grid.lower)) / np.asarray(self.grid.cell)).astype(int)
         c = np.clip(c, 0, np.asarray(self.grid.shape) - 1)
         cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]
@@ -267,8 +268,15 @@ class Neighbors:
         order = np.argsort(cell, kind="stable")
         # One kernel for all: each field's own would cost some 0.05 s at start.
         place_proxies(wall, proxies, *(a[order] for a in given))
+        self.move_wall(wall, wall.level, wall.rate)
         start = np.searchsorted(cell[order], np.arange(cells + 1))
         proxies.cell_start.from_numpy(start.astype(np.int32))
+
+    def move_wall(self, wall: Wall, level: float, rate: float) -> None:
+        """Put a wall that pulses at a level, 0 narrow to 1 wide, moving at a rate [1/s]."""
+        wall.level, wall.rate = level, rate
+        if wall.pulses:
+            move_proxies(wall, self.proxies, len(wall.given.position), level, rate)
 
     def build(self, particles: Particles, wall: Wall) -> None:
         """Drop removed particles (identity < 0), sort the rest and build the lists anew.
@@ -304,6 +312,8 @@ def place_proxies(
     position: ti.types.ndarray(ndim=2),
     normal: ti.types.ndarray(ndim=2),
     volume: ti.types.ndarray(ndim=1),
+    swing: ti.types.ndarray(ndim=1),
+    wide_volume: ti.types.ndarray(ndim=1),
 ):
     """Proxies in the order of the grid.  Writes: the wall's fields, points."""
     for k in range(volume.shape[0]):
@@ -311,9 +321,30 @@ def place_proxies(
             w.position[k][a] = position[k, a]
             w.normal[k][a] = normal[k, a]
         w.volume[k] = volume[k]
+        if ti.static(w.pulses):
+            w.narrow[k] = w.position[k]
+            w.swing[k] = swing[k] * w.normal[k]
+            w.narrow_volume[k] = volume[k]
+            w.wide_volume[k] = wide_volume[k]
         points.x[k] = position[k, 0]
         points.y[k] = position[k, 1]
         points.z[k] = position[k, 2]
+
+
+@ti.kernel
+def move_proxies(w: ti.template(), points: ti.template(), count: int, level: float, rate: float):
+    """x_k = narrow + level swing, v_k = rate swing, V_k (Eq. 3) on a line between its two ends.
+
+    The normals are those of the wall at its narrowest.  Writes: position, velocity, volume, points.
+    """
+    for k in range(count):
+        x = w.narrow[k] + level * w.swing[k]
+        w.position[k] = x
+        w.velocity[k] = rate * w.swing[k]
+        w.volume[k] = w.narrow_volume[k] + level * (w.wide_volume[k] - w.narrow_volume[k])
+        points.x[k] = x[0]
+        points.y[k] = x[1]
+        points.z[k] = x[2]
 
 
 @ti.func

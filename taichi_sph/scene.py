@@ -68,6 +68,16 @@ class OpeningTable(_Table):
             raise ValueError("a waveform needs a flow [m^3/s] or a pressure [Pa] to multiply")
 
 
+class WallTable(_Table):
+    """A wall that pulses; without this table it stands still."""
+
+    pulse: Positive
+    """How far it moves out along its normal [m]; the surface of the file is its narrowest."""
+    waveform: str
+    """When: the name of a built-in waveform, or a CSV file (time [s], factor), relative to the
+    scene file; its lowest factor is narrow, its highest wide."""
+
+
 class ToolTable(_Table):
     """A rigid tool that a session moves."""
 
@@ -168,6 +178,7 @@ class Scene(_Table):
     """Openings by name; one that the surface has and the scene does not name is capped."""
     blood: Blood = Blood()
     tool: ToolTable | None = None
+    wall: WallTable | None = None
     folder: str = "."
     """Where relative paths start: the scene file's folder (set by the reader)."""
     name: str = "scene"
@@ -194,6 +205,7 @@ _TABLES = {
     "discretization": Discretization,
     "openings": OpeningTable,
     "tool": ToolTable,
+    "wall": WallTable,
 }
 _SET_BY_READER = ("folder", "name", "text")
 

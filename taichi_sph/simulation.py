@@ -20,6 +20,7 @@ from taichi_sph.motion import Motion
 from taichi_sph.neighbors import Neighbors, cells_within, make_grid
 from taichi_sph.particles import Particles
 from taichi_sph.pistons import LEAST_APART, Piston, Pistons, add_blood, plug_sites, sleeve
+from taichi_sph.pulse import read_pulse
 from taichi_sph.rheology import rheology_of
 from taichi_sph.runtime import number
 from taichi_sph.scene import Scene
@@ -94,8 +95,12 @@ class Simulation(Motion):
         plugs = Pistons(
             make_pistons(scene, vessel), grid.spacing, kernel.support_radius, scene.blood.density
         )
+        self.pulse = read_pulse(scene, vessel)
         sample = vessel.sample_wall(wall_spacing, setback, seed)
         proxies, normals = [sample.positions], [sample.normals]
+        swing = np.zeros(len(sample.positions))
+        if self.pulse is not None:
+            swing = self.pulse.reach(vessel, sample.positions - setback * sample.normals)
         for piston in plugs.each:
             rim = vessel.rim(vessel.openings.index(piston.opening))
             tube = sleeve(rim, piston.opening, wall_spacing, setback, plugs.gates.depth)
@@ -127,14 +132,16 @@ class Simulation(Motion):
         particles = Particles.from_numpy(
             blood, mass=scene.blood.density * grid.spacing**3, room=room
         )
+        still = np.zeros(sum(map(len, proxies)) - len(swing))
         wall = Wall.from_numpy(
             np.concatenate(proxies), np.concatenate(normals), kernel, setback, wall_spacing,
-            tool=tool.count,
+            tool=tool.count, swing=np.concatenate([swing, still]),
         )  # fmt: skip
         skin = SKIN * kernel.support_radius
-        margin = 2.0 * (kernel.support_radius + skin) + (plugs.gates.depth if plugs.each else 0.0)
+        margin = 2.0 * (kernel.support_radius + skin) + wall.most_swing
+        margin += plugs.gates.depth if plugs.each else 0.0
         lower, upper = vessel.vertices.min(axis=0) - margin, vessel.vertices.max(axis=0) + margin
-        cells = make_grid(lower, upper, kernel.support_radius + skin)
+        cells = make_grid(lower, upper, kernel.support_radius + skin + 0.5 * wall.most_swing)
         neighbors = Neighbors.allocate(
             cells,
             kernel.support_radius,
@@ -210,6 +217,7 @@ class Simulation(Motion):
         for piston in self.pistons:
             piston.start_again()
         self.surgery.start_again(0.0)
+        self._pulse_until(0.0)
         self.time = self.last_step = self.fallback_time = 0.0
         self.steps = self.wall_corrections = 0
 
@@ -220,6 +228,7 @@ class Simulation(Motion):
         self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections = clock
         self.gravity = self.scene.gravity
         self.surgery.start_again(self.time)
+        self._pulse_until(self.time)
 
     def put(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
         """Replace the blood: identities (n,), positions [m] and velocities [m/s], (n, 3)."""
@@ -240,6 +249,7 @@ class Simulation(Motion):
             "added": self.added,
             "next_identity": self._next_identity,
             "pistons": [piston.state() for piston in self._pistons.each],
+            "wall": [self.wall.level, self.wall.rate],
             **self.surgery.state(),
         }
         return Snapshot(
@@ -282,6 +292,7 @@ class Simulation(Motion):
         for piston, row in zip(self._pistons.each, controls["pistons"], strict=True):
             piston.go_on_from(row)
         self.surgery.go_on_from(controls)
+        self.neighbors.move_wall(self.wall, *controls["wall"])
         self._stale = True
 
     def switch(self, model: AccelerationModel) -> None:
@@ -386,14 +397,22 @@ class Simulation(Motion):
             self._next_identity += added
 
     def before_drift(self, dt: float) -> None:
-        """Move plugs and tool by a step of dt [s]."""
+        """Move plugs, tool and wall by a step of dt [s]."""
         if self._pistons.each:
             self._pistons.advance(self.particles, self.time, dt, self.gravity)
         if self.wall.tool and self.model.pairwise is not None:
             force = force_on_tool(self.particles, self.wall, self.neighbors, *self.model.pairwise)
             self._impulse += dt * np.array([force[0], force[1], force[2]])
             self._impulse_time += dt
-        self._wall_moved += self.surgery.before_drift(dt)
+        self._wall_moved += self.surgery.before_drift(dt) + self._pulse_until(self.time + dt)
+
+    def _pulse_until(self, time: float) -> float:
+        """Put the wall where its pulse wants it at a time [s]; returns how far it has moved [m]."""
+        if self.pulse is None:
+            return 0.0
+        before = self.wall.level
+        self.neighbors.move_wall(self.wall, self.pulse.level(time), self.pulse.rate(time))
+        return self.wall.most_swing * abs(self.wall.level - before)
 
     def positions(self) -> np.ndarray:
         """Positions of the live blood [m], shape (n, 3), in order of identity."""
@@ -423,7 +442,8 @@ class Simulation(Motion):
         for wound in self.surgery.wounds:
             # Blood in the hole has not leaked.
             held &= wound.distance(x) > wound.radius + 3.0 * self.scene.discretization.spacing
-        leaks = self.vessel.count_leaks(x[held]) + int(account[LOST])
+        swung = self.wall.level * self.wall.most_swing
+        leaks = self.vessel.count_leaks(x[held], swung) + int(account[LOST])
         return diagnose(
             self, density, drained, leaks,
             added=self.added, bled=int(exits[len(names) :].sum()), sucked=int(account[SUCTION]),

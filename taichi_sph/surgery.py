@@ -15,7 +15,7 @@ from taichi_sph.smoothing_kernels import WendlandC2
 from taichi_sph.surface import Booleans, Floats, plane_axes
 from taichi_sph.tool import Tool
 from taichi_sph.vessel import Vessel
-from taichi_sph.wall import Wall, refreshed_volumes
+from taichi_sph.wall import Proxies, Wall, refreshed_volumes
 
 MOST_WOUNDS = 16
 """Wounds of a session, closed ones too: each keeps its account."""
@@ -156,7 +156,9 @@ class Surgery:
         first, second = plane_axes(wound.normal)
         line = wound.end - wound.begin
         widest = wound.radius + ASIDE * d
-        for lift in (OUTSIDE * d, (OUTSIDE + 0.5) * d, (OUTSIDE + 1.0) * d):
+        # Where the wall pulses, outside is beyond its widest.
+        outside = self.wall.most_swing + OUTSIDE * d
+        for lift in (outside, outside + 0.5 * d, outside + d):
             across = np.arange(-widest, widest + 0.5 * d, 0.5 * d)
             up = np.arange(lift, widest, 0.5 * d)
             a, b, c = (x.ravel() for x in np.meshgrid(across, across, up, indexing="ij"))
@@ -198,7 +200,7 @@ class Surgery:
             return
         self.exits.mark(particles, self.neighbors.grid, time)
         self.exits.shut(k)
-        position, normal, _ = self._intact
+        intact = self._intact
         comes_back = self._hole(wound)
         wound.is_open = False
         for other in self.wounds:
@@ -206,9 +208,9 @@ class Surgery:
                 comes_back &= ~self._hole(other)
         if comes_back.any():
             live = particles.position.to_numpy()[: particles.count[None]].astype(float)
-            feet = position - self.wall.setback * normal
+            feet = intact.at(self.wall.level) - self.wall.setback * intact.normal
             away, nearest = cKDTree(feet).query(live)
-            height = ((live - feet[nearest]) * normal[nearest]).sum(axis=1)
+            height = ((live - feet[nearest]) * intact.normal[nearest]).sum(axis=1)
             # Blood before wall that stayed is seated as it is.
             under = comes_back[nearest] & (height > -SEATED * self.spacing)
             self.exits.take(particles, under & (away < ASIDE * self.spacing), k)
@@ -216,7 +218,7 @@ class Surgery:
 
     def _hole(self, wound: Wound) -> Booleans:
         """Which proxies of the whole wall a wound takes away, (m,)."""
-        position, normal, _ = self._intact
+        position, normal = self._intact.position, self._intact.normal
         away = wound.distance(position - self.wall.setback * normal)
         # Each proxy is the wall for half a spacing round it; across a thin vessel they stay.
         hole = away < wound.radius + 0.5 * self.wall.spacing
@@ -224,7 +226,8 @@ class Surgery:
 
     def _make_wall(self) -> None:
         """The wall without the proxies of open wounds (paper, Eq. 3: the rim's volumes anew)."""
-        position, normal, volume = self._intact
+        whole = self._intact
+        position, swing = whole.position, self.wall.most_swing
         if len(position) == 0:
             return
         gone = np.zeros(len(position), bool)
@@ -233,10 +236,14 @@ class Surgery:
                 gone |= self._hole(wound)
         near = np.zeros(len(position), bool)
         if gone.any():
-            near = cKDTree(position[gone]).query(position)[0] < self.kernel.support_radius
-        left = ~gone
-        volume = refreshed_volumes(position[left], volume[left], self.kernel, near[left])
-        self.wall.given = position[left], normal[left], volume
+            reach = self.kernel.support_radius + 2.0 * swing
+            near = cKDTree(position[gone]).query(position)[0] < reach
+        left = Proxies(*(rows[~gone] for rows in whole))
+        volume, wide_volume = (
+            refreshed_volumes(left.at(level), volume, self.kernel, near[~gone])
+            for level, volume in ((0.0, left.volume), (1.0, left.wide_volume))
+        )
+        self.wall.given = left._replace(volume=volume, wide_volume=wide_volume)
         self.neighbors.sort_wall(self.wall)
 
     def rehearse(self, particles: Particles) -> None:

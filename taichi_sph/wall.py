@@ -1,12 +1,35 @@
-"""The wall: a layer of fixed proxy particles behind the lumen surface (paper, 1.1)."""
+"""The wall: a layer of proxy particles behind the lumen surface (paper, 1.1).
+
+They stand still, or move out and back along their normals as the vessel's pulse wants it.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
 from taichi_sph.smoothing_kernels import WendlandC2
+
+
+class Proxies(NamedTuple):
+    """Proxies in any order, on the host."""
+
+    position: np.ndarray
+    """x_k [m], (m, 3); of a wall that pulses, at its narrowest."""
+    normal: np.ndarray
+    """Unit normal out of the lumen, (m, 3)."""
+    volume: np.ndarray
+    """V_k of Eq. 3 with gamma = 1 [m^3], (m,)."""
+    swing: np.ndarray
+    """How far a proxy moves along its normal in a pulse [m], (m,)."""
+    wide_volume: np.ndarray
+    """V_k where all have moved as far [m^3], (m,)."""
+
+    def at(self, level: float) -> np.ndarray:
+        """Positions [m], (m, 3), at a level of the pulse, 0 narrow to 1 wide."""
+        return np.asarray(self.position + level * self.swing[:, None] * self.normal)
 
 
 @dataclass(eq=False)
@@ -25,17 +48,36 @@ class Wall:
     """Unit normal out of the lumen, shape (max(count, 1),)."""
     volume: ti.Field
     """V_k of Eq. 3 with gamma = 1 [m^3], shape (max(count, 1),)."""
-    given: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """The same three in the order in which they were given; the lists put them into the fields."""
+    given: Proxies
+    """The same in the order in which they were given; the lists put them into the fields."""
+    swing: ti.MatrixField
+    """Way from narrow to wide [m], shape as position where the wall pulses, else (1,)."""
+    narrow: ti.MatrixField
+    """Position at the narrowest [m], likewise."""
+    narrow_volume: ti.Field
+    """Volume at the narrowest [m^3], likewise."""
+    wide_volume: ti.Field
+    """Volume at the widest [m^3], likewise."""
     tool: int
     """Proxies of a tool: rows count to count + tool, which no cell holds."""
     velocity: ti.MatrixField
     """v_k [m/s], shape as position where proxies move, else (1,)."""
+    most_swing: float = 0.0
+    """Of any proxy [m]."""
+    level: float = 0.0
+    """Where the pulse is, 0 narrow to 1 wide."""
+    rate: float = 0.0
+    """Its rate [1/s]."""
 
     @property
     def moves(self) -> bool:
         """Whether any proxy may move."""
-        return self.tool > 0
+        return self.tool > 0 or self.pulses
+
+    @property
+    def pulses(self) -> bool:
+        """Whether the vessel's own proxies move."""
+        return self.most_swing > 0.0
 
     @classmethod
     def from_numpy(
@@ -47,14 +89,22 @@ class Wall:
         spacing: float,
         period: np.ndarray | None = None,
         tool: int = 0,
+        swing: np.ndarray | None = None,
     ) -> "Wall":
         """Proxies at given positions [m] and outward normals, shape (m, 3).
 
         `period` [m] repeats the wall along the axes where it is not zero; there is room for the
-        proxies of a tool.
+        proxies of a tool.  `swing` [m], (m,), is the way of each along its normal in a pulse.
         """
         m = len(position)
         rows = max(m + tool, 1)
+        volume = proxy_volumes(position, kernel, period) if m else np.zeros(0)
+        most = 0.0 if swing is None else float(swing.max(initial=0.0))
+        given = Proxies(position, normal, volume, np.zeros(m), volume)
+        if swing is not None and most > 0.0:
+            wide = position + swing[:, None] * normal
+            given = Proxies(position, normal, volume, swing, proxy_volumes(wide, kernel, period))
+        moving, pulsing = rows if tool or most else 1, rows if most else 1
         return cls(
             count=m,
             setback=setback,
@@ -62,9 +112,14 @@ class Wall:
             position=ti.Vector.field(3, float, rows),
             normal=ti.Vector.field(3, float, rows),
             volume=ti.field(float, rows),
-            given=(position, normal, proxy_volumes(position, kernel, period) if m else np.zeros(0)),
+            given=given,
+            swing=ti.Vector.field(3, float, pulsing),
+            narrow=ti.Vector.field(3, float, pulsing),
+            narrow_volume=ti.field(float, pulsing),
+            wide_volume=ti.field(float, pulsing),
             tool=tool,
-            velocity=ti.Vector.field(3, float, rows if tool else 1),
+            velocity=ti.Vector.field(3, float, moving),
+            most_swing=most,
         )
 
 

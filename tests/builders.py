@@ -23,7 +23,7 @@ from taichi_sph.neighbors import Neighbors, make_grid
 from taichi_sph.particles import Particles
 from taichi_sph.rheology import Newtonian
 from taichi_sph.smoothing_kernels import WendlandC2
-from taichi_sph.wall import Wall, proxy_volumes
+from taichi_sph.wall import Proxies, Wall, proxy_volumes
 
 D = 1e-3
 """Spacing of blood [m]."""
@@ -145,7 +145,7 @@ class Stage:
     def put_wall(self, position: np.ndarray, normal: np.ndarray) -> None:
         """Replace the proxies (as many) and sort them."""
         volume = proxy_volumes(position, KERNEL, self.period)
-        self.wall.given = position, normal, volume
+        self.wall.given = Proxies(position, normal, volume, np.zeros(len(position)), volume)
         self.neighbors.sort_wall(self.wall)
 
     def build(self) -> None:

@@ -48,6 +48,7 @@ class FakeSimulation:
         self.velocity = np.zeros((particles, 3), np.float32)
         self.velocity[:, 2] = -np.linspace(0.0, 1.0, particles)
         tool = SimpleNamespace(shape=None, position=np.zeros(3))
+        self.pulse = None
         self.surgery = SimpleNamespace(wounds=[], tool=tool, suction_rate=0.0)
 
     def advance_to(self, time: float, before_step: Callable[[], None] | None = None) -> None:

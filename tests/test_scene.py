@@ -44,13 +44,13 @@ MISTAKES = {
         "duration = 0.1",
         "duration = 0.1\ncolour = 3",
         "scene.toml: unknown key colour; allowed: title, vessel, column, discretization, duration, "
-        "frame_interval, gravity, openings, blood, tool",
+        "frame_interval, gravity, openings, blood, tool, wall",
     ),
     "unknown table": (
         "[column]",
         "[colum]",
         "scene.toml: unknown key colum; allowed: title, vessel, column, discretization, duration, "
-        "frame_interval, gravity, openings, blood, tool",
+        "frame_interval, gravity, openings, blood, tool, wall",
     ),
     "key of another law": (
         'model = "casson"',

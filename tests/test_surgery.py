@@ -26,6 +26,7 @@ from taichi_sph.smoothing_kernels import WendlandC2
 from taichi_sph.surgery import LEAST_RADIUS, MOST_WOUNDS, Surgery, Wound
 from taichi_sph.tool import Tool
 from taichi_sph.vessel import Vessel, read_vessel
+from taichi_sph.wall import Proxies
 from taichi_sph.wall import proxy_volumes as wall_volumes
 
 VESSELS = Path(__file__).parent.parent / "assets" / "vessels"
@@ -110,9 +111,10 @@ def opened(name: str) -> Opened:
     setback = calibrate(kernel, spacing, beside, DENSITY).setback
     sample = vessel.sample_wall(beside, setback)
     volume = wall_volumes(sample.positions, kernel)
+    given = Proxies(sample.positions, sample.normals, volume, np.zeros(len(volume)), volume)
     wall = SimpleNamespace(
-        given=(sample.positions, sample.normals, volume), setback=setback, spacing=beside
-    )
+        given=given, setback=setback, spacing=beside, most_swing=0.0, level=0.0
+    )  # fmt: skip
     return Opened(vessel, spacing, kernel, wall)
 
 
@@ -140,7 +142,7 @@ class Cut:
 def cuts(name: str) -> list[Cut]:
     """Wounds all over a shipped vessel, one at a time."""
     case, found = opened(name), []
-    position, normal, _ = case.wall.given
+    position, normal = case.wall.given[:2]
     some = np.random.default_rng(1).choice(len(position), 120, replace=False)[20:60]
     x = case.vessel.fill_column(
         Column(opening=case.vessel.openings[0].name, full=True), case.spacing
@@ -152,7 +154,7 @@ def cuts(name: str) -> list[Cut]:
             wound = case.surgery.wound(place, 2.0 * case.spacing)
         except InputError:
             continue  # at an opening
-        left, _, volume = case.wall.given
+        left, _, volume = case.wall.given[:3]
         # Only those that reach the hole can have changed.
         apart = np.linalg.norm(left - place, axis=1) / case.spacing
         near, wide = apart < 7.0, apart < 9.5
@@ -320,7 +322,7 @@ def test_one_wound_too_many_is_refused_closed_ones_counted(sim):
 
 @pytest.mark.parametrize("end", [None, np.array([4e-3, -3e-3, -2e-3])], ids=["puncture", "cut"])
 def test_the_wall_loses_the_proxies_of_the_hole_and_no_others(sim, end):
-    position, normal, _ = sim.wall.given
+    position, normal = sim.wall.given[:2]
     wound = sim.wound(SIDE, HOLE, end)
     # A proxy stands for the wall half a spacing round where it was set back from.
     feet = position - sim.wall.setback * normal
@@ -330,7 +332,7 @@ def test_the_wall_loses_the_proxies_of_the_hole_and_no_others(sim, end):
     assert np.abs(away - HOLE - 0.5 * D).min() > 1e-6 * D
     # Through this hole a wall across the tube is out of reach.
     assert np.all(normal[lost] @ wound.normal > 0.0)
-    left, _, volume = sim.wall.given
+    left, _, volume = sim.wall.given[:3]
     np.testing.assert_array_equal(left, position[~lost])
     assert lost.sum() == pytest.approx(Wound(*_line(wound), HOLE + 0.5 * D).area / D**2, rel=0.3)
     np.testing.assert_allclose(volume, proxy_volumes(left, 2.0 * D), rtol=VOLUMES)
