@@ -159,8 +159,10 @@ class Session:
                 self.auto = entry.to_auto
         after = [entry for entry in kept.entries if entry.step >= state.steps]
         self.recorded = [e for e in after if e.source not in ("script", "auto") and not e.timeless]
-        done_until = state.time - state.last_step
-        self._script = [entry for entry in self._script if entry[0] > done_until]
+        if state.steps:
+            # Done is what was due when its last step began, by the rule of `before_step`.
+            done_until = (state.time - state.last_step) * (1.0 + 1e-12)
+            self._script = [entry for entry in self._script if entry[0] > done_until]
 
     def replay(self, kept: "Kept") -> None:
         """Do again all that a log holds; `auto` chooses as it did."""

@@ -1,9 +1,12 @@
 """Sessions: commands, script, log and replay, on a small tube that a pump and a reservoir drive."""
 
 import json
+import random
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -298,22 +301,34 @@ def test_a_replay_notices_another_course(kept, tmp_path):
     assert "differs from frame" in error.splitlines()[-1]
 
 
-def test_a_session_killed_and_resumed_ends_bitwise_like_the_whole_one(kept, driven, tmp_path):
+@pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.validation)])
+def test_a_session_killed_again_and_again_ends_bitwise_like_the_whole_one(
+    kept, driven, tmp_path, kills
+):
     shutil.copy(kept / "script.jsonl", tmp_path)
     command = [
         "run", str(driven), "--model", "implicit", "--script", str(tmp_path / "script.jsonl"),
         "--session", "s.jsonl", "--checkpoint", "1",
     ]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-m", "app", *command], cwd=tmp_path, env=HERE, stderr=subprocess.DEVNULL
-    )
-    log = tmp_path / "s.jsonl"
-    while not (log.is_file() and '"frame": 6' in log.read_text()):
-        assert process.poll() is None
-    process.kill()
-    process.wait()
-    checkpoint = f"{driven.name}.checkpoint.npz"
-    vesselflow(tmp_path, *command, "--resume", checkpoint)
+    log, checkpoint = tmp_path / "s.jsonl", tmp_path / f"{driven.name}.checkpoint.npz"
+    moments, ends = random.Random(0), []
+    for _ in range(kills):
+        begun = log.read_text().count('"frame"') if log.is_file() else 0
+        go_on = ["--resume", checkpoint.name] if checkpoint.is_file() else []
+        process = subprocess.Popen(
+            [sys.executable, "-m", "app", *command, *go_on],
+            cwd=tmp_path, env=HERE, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        # It has begun the log anew with what was before, and then gone on: now any moment will do.
+        while process.poll() is None and not (
+            log.is_file() and log.read_text().count('"frame"') > min(begun, 8)
+        ):
+            time.sleep(0.001)
+        time.sleep(moments.uniform(0.0, 0.05))
+        process.kill()
+        ends.append(process.wait())
+    assert ends.count(-signal.SIGKILL) > kills // 2
+    vesselflow(tmp_path, *command, "--resume", checkpoint.name)
     whole, again = (read_session(f / "s.jsonl", "replay") for f in (kept, tmp_path))
     assert whole.digests == again.digests
     assert whole.rows == again.rows
