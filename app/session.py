@@ -160,9 +160,9 @@ class Session:
         after = [entry for entry in kept.entries if entry.step >= state.steps]
         self.recorded = [e for e in after if e.source not in ("script", "auto") and not e.timeless]
         if state.steps:
-            # Done is what was due when its last step began, by the rule of `before_step`.
-            done_until = (state.time - state.last_step) * (1.0 + 1e-12)
-            self._script = [entry for entry in self._script if entry[0] > done_until]
+            # Done is what was due when its last step began.
+            began = state.time - state.last_step
+            self._script = [entry for entry in self._script if not is_due(entry[0], began)]
 
     def replay(self, kept: "Kept") -> None:
         """Do again all that a log holds; `auto` chooses as it did."""
@@ -251,7 +251,7 @@ class Session:
         while self.recorded and self.recorded[0].step <= simulation.steps:
             entry = self.recorded.pop(0)
             self._apply(entry.command, entry.source)
-        while self._script and self._script[0][0] <= simulation.time * (1.0 + 1e-12):
+        while self._script and is_due(self._script[0][0], simulation.time):
             self._apply(self._script.pop(0)[1], "script")
         for _ in range(MOST_WAITING):
             try:
@@ -431,6 +431,11 @@ def digest(simulation: "Simulation") -> str:
     for field in (p.identity, p.position, p.velocity):
         text.update(np.ascontiguousarray(field.to_numpy()[:n]).tobytes())
     return text.hexdigest()[:16]
+
+
+def is_due(at: float, time: float) -> bool:
+    """Whether a script's command for one time [s] is due at another; sums of steps round."""
+    return at <= time * (1.0 + 1e-12)
 
 
 def read_script(path: Path) -> list[tuple[float, AnyCommand]]:

@@ -6,6 +6,7 @@ is held at the vessel's openings.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +33,13 @@ class Pulse:
     """From narrow to wide, far from openings [m]."""
     waveform: Waveform
 
+    @cached_property
+    def _range(self) -> tuple[float, float]:
+        return float(self.waveform.factor.min()), float(self.waveform.factor.max())
+
     def level(self, time: float) -> float:
         """0 narrow to 1 wide, at a time [s]."""
-        low, high = float(self.waveform.factor.min()), float(self.waveform.factor.max())
+        low, high = self._range
         risen = min(1.0, max(0.0, time / RISE))
         return risen * (self.waveform(time) - low) / (high - low)
 

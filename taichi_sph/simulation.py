@@ -98,14 +98,15 @@ class Simulation(Motion):
         self.pulse = read_pulse(scene, vessel)
         sample = vessel.sample_wall(wall_spacing, setback, seed)
         proxies, normals = [sample.positions], [sample.normals]
-        swing = np.zeros(len(sample.positions))
+        swings = [np.zeros(len(sample.positions))]
         if self.pulse is not None:
-            swing = self.pulse.reach(vessel, sample.positions - setback * sample.normals)
+            swings = [self.pulse.reach(vessel, sample.positions - setback * sample.normals)]
         for piston in plugs.each:
             rim = vessel.rim(vessel.openings.index(piston.opening))
             tube = sleeve(rim, piston.opening, wall_spacing, setback, plugs.gates.depth)
             proxies.append(tube[0])
             normals.append(tube[1])
+            swings.append(np.zeros(len(tube[0])))
         tool = make_tool(scene, vessel, wall_spacing, setback, kernel)
         column = vessel.fill_column(scene.column, grid.spacing)
         if tool.shape is not None and len(column):
@@ -132,10 +133,9 @@ class Simulation(Motion):
         particles = Particles.from_numpy(
             blood, mass=scene.blood.density * grid.spacing**3, room=room
         )
-        still = np.zeros(sum(map(len, proxies)) - len(swing))
         wall = Wall.from_numpy(
             np.concatenate(proxies), np.concatenate(normals), kernel, setback, wall_spacing,
-            tool=tool.count, swing=np.concatenate([swing, still]),
+            tool=tool.count, swing=np.concatenate(swings),
         )  # fmt: skip
         skin = SKIN * kernel.support_radius
         margin = 2.0 * (kernel.support_radius + skin) + wall.most_swing
@@ -204,29 +204,28 @@ class Simulation(Motion):
         Raises:
             InputError: there is no room for so many.
         """
-        particles = self.particles
-        if len(position) > particles.capacity:
+        if len(position) > self.particles.capacity:
             raise InputError(
-                f"{len(position)} particles: there is room for {particles.capacity}, those of the "
-                "scene's column"
+                f"{len(position)} particles: there is room for {self.particles.capacity}, those of "
+                "the scene's column"
             )
+        self.time = self.last_step = self.fallback_time = 0.0
+        self.steps = self.wall_corrections = 0
+        self._start_again(position, velocity)
+
+    def reset(self) -> None:
+        """Blood, pistons, wounds, tool and gravity as at the start; clock and steps go on."""
+        self.gravity = self.scene.gravity
+        self._start_again(self._initial, np.zeros_like(self._initial))
+
+    def _start_again(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """All but gravity as at the start, with such blood, whatever the clock says."""
         self.put(np.arange(len(position)), position, velocity)
-        particles.acceleration.fill(0.0)
+        self.particles.acceleration.fill(0.0)
         self.exits.removed.fill(0)
         self.added, self._next_identity = 0, len(position)
         for piston in self.pistons:
             piston.start_again()
-        self.surgery.start_again(0.0)
-        self._pulse_until(0.0)
-        self.time = self.last_step = self.fallback_time = 0.0
-        self.steps = self.wall_corrections = 0
-
-    def reset(self) -> None:
-        """Blood, pistons, wounds, tool and gravity as at the start; clock and steps go on."""
-        clock = self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections
-        self.place(self._initial, np.zeros_like(self._initial))
-        self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections = clock
-        self.gravity = self.scene.gravity
         self.surgery.start_again(self.time)
         self._pulse_until(self.time)
 

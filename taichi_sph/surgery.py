@@ -239,10 +239,10 @@ class Surgery:
             reach = self.kernel.support_radius + 2.0 * swing
             near = cKDTree(position[gone]).query(position)[0] < reach
         left = Proxies(*(rows[~gone] for rows in whole))
-        volume, wide_volume = (
-            refreshed_volumes(left.at(level), volume, self.kernel, near[~gone])
-            for level, volume in ((0.0, left.volume), (1.0, left.wide_volume))
-        )
+        near = near[~gone]
+        volume = wide_volume = refreshed_volumes(left.position, left.volume, self.kernel, near)
+        if swing:
+            wide_volume = refreshed_volumes(left.at(1.0), left.wide_volume, self.kernel, near)
         self.wall.given = left._replace(volume=volume, wide_volume=wide_volume)
         self.neighbors.sort_wall(self.wall)
 
