@@ -114,10 +114,13 @@ class Simulation(Motion):
             clear = tool.shape.distance(about) > 0.5 * grid.spacing
             column = column[clear & tool.shape.clear_of(about)]
         blood = np.concatenate([column, plugs.initial_blood(column)])
-        # What flows in may fill the vessel and pack it closer than the lattice did.
+        # What flows in may fill the vessel, at its widest, and pack it closer than the lattice did.
         room = 0
         if plugs.each:
-            full = vessel.volume / grid.spacing**3 + plugs.capacity
+            widest = vessel.volume
+            if self.pulse is not None:
+                widest += vessel.wall_area * self.pulse.swing
+            full = widest / grid.spacing**3 + plugs.capacity
             room = max(0, math.ceil(1.1 * full) - len(blood))
         self._initial = blood
         self.derived: Derived = derive(scene, vessel, len(blood), sum(map(len, proxies)))
