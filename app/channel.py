@@ -186,11 +186,10 @@ class Channel:
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         """Do what a line says."""
-        try:
-            msgspec.json.decode(line, type=_Query)
-            return {"figures": self._session.figures()}
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            pass
+        if b"query" in line:  # no command has such a word
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+                msgspec.json.decode(line, type=_Query)
+                return {"figures": self._session.figures()}
         try:
             self._session.offer(line, "channel")
         except InputError as error:

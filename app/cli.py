@@ -295,18 +295,18 @@ def run(
         observers.append(acting)
     elif begun is not None:
         simulation.go_on_from(begun.state)
-    if checkpoint is not None:
-        observers.append(Checkpointer(kept, checkpoint, facts))
     if rrd is not None or live is not None:
         from app.view import RerunView
 
         shown = {key: facts[key] for key in ("arch", "precision", "seed", "version")}
-        view = RerunView(simulation, rrd, live, every, shown)
+        view = RerunView(simulation, rrd, live, every, shown, checkpoint)
         observers.append(view)
         if view.live:
             click.echo(f"live view: rerun --connect {view.live.url}", err=True)
         if acting:
             acting.notes.append(view.note)
+    if checkpoint is not None:  # last: what came before it is safe by then
+        observers.append(Checkpointer(kept, checkpoint, facts))
     with contextlib.ExitStack() as doors:
         if acting is not None and control is not None:
             open_doors(acting, control, host, doors)

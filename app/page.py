@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 _PERIOD = 0.05
 """Between two updates [s]."""
-_SHARE = 0.1
-"""Of its time, the page spends no more than this on frames."""
+_SHARE = 0.02
+"""Of a processor's time, the page's own thread spends no more than this on frames."""
 _FIGURES_PERIOD = 0.2
 """Between two updates of the figures [s]: faster nobody reads."""
 _SHOWN = 8.0
@@ -205,6 +205,8 @@ class ControlPage:
         self._wishes: queue.SimpleQueue[tuple[object, Command]] = queue.SimpleQueue()
         self._refusals: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._closing = threading.Event()
+        self.pictures = 0
+        """Shown so far."""
         self._time: float | None = None
         self._wounds: dict[int, Wound] = {}
         self._rims: list[Any] = []
@@ -387,10 +389,14 @@ class ControlPage:
                 figures = self._session.figures()
                 if "time" in figures:
                     self._figures.content = figures_table(figures)
-            picture = self._session.picture()
+            if now < next_frame - _PERIOD:
+                continue
+            picture = self._session.picture()  # asked for before it is needed, so that it is fresh
             if picture is not None and now >= next_frame:
+                began = time.thread_time()
                 self._show(picture)
-                next_frame = now + (time.monotonic() - now) / _SHARE
+                self.pictures += 1
+                next_frame = now + (time.thread_time() - began) / _SHARE
 
     def _hand_on(self) -> None:
         """Offer what was asked for since the last time, and say what was refused.
@@ -419,7 +425,8 @@ class ControlPage:
             colours = packed.astype(">u4").view(np.uint8).reshape(-1, 4)[:, :3]
             with self._server.atomic():
                 self._blood.points, self._blood.colors = picture.positions, colours
-                self._drops.points = picture.drops
+                if len(picture.drops) or len(self._drops.points):
+                    self._drops.points = picture.drops
         self._body.position = self._tool.position
         self._body.wxyz = np.roll(self._tool.rotation.as_quat(), 1)
         wounds = {k: w for k, w in enumerate(self._simulation.surgery.wounds) if w.is_open}

@@ -4,11 +4,14 @@ File and live view are two streams.  Rerun blocks a stream whose viewer has stal
 one has a thread and a short queue that drops frames, and nothing waits for it.  The file has all.
 """
 
+import contextlib
 import errno
 import os
 import queue
+import select
 import socket
 import threading
+import time
 import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,10 +40,14 @@ if TYPE_CHECKING:
     from taichi_sph.simulation import Simulation
 
 APPLICATION = "vesselflow"
-LIVE_MEMORY = "256MiB"
-"""What the server keeps of the past for viewers that come late."""
+LIVE_MEMORY = "64MiB"
+"""What the server keeps of the past for viewers that come late; it takes twice that."""
 _BATCH = 64 << 20
 """Bytes of a batch: with the default small rows starve beside large ones."""
+_FILE_TICK = 1.0
+"""Between two writes to the file [s]: of each Rerun remembers some 4 kB for the file's end."""
+_LIVE_TICK = 0.02
+"""Between two messages to viewers [s]."""
 _CLOSE_TIMEOUT = 60.0
 """Longest wait for the disk at the end [s]."""
 _LIVE_TIMEOUT = 2.0
@@ -109,6 +116,7 @@ class FileWriter:
             self._file = open(path, "wb", buffering=0)  # noqa: SIM115
         except OSError as error:
             raise InputError(f"--rrd {path}: cannot be written: {error.strerror}") from None
+        self._pumping = threading.Lock()
         self._source, self._sink = os.pipe()
         self.sink_path = f"/dev/fd/{self._sink}"
         self._thread = threading.Thread(target=self._pump, daemon=True, name="recording")
@@ -119,13 +127,17 @@ class FileWriter:
         os.close(self._sink)
 
     def _pump(self) -> None:
-        while data := os.read(self._source, 1 << 20):
-            rest = memoryview(data)
-            try:
-                while rest and not self.error:
-                    rest = rest[self._file.write(rest) :]
-            except OSError as error:
-                self.error = error
+        data = b"all"
+        while data:
+            select.select([self._source], [], [])
+            with self._pumping:
+                data = os.read(self._source, 1 << 20)
+                rest = memoryview(data)
+                try:
+                    while rest and not self.error:
+                        rest = rest[self._file.write(rest) :]
+                except OSError as error:
+                    self.error = error
         try:
             # Some file systems tell of a full disk only now; a device cannot be synchronised.
             os.fsync(self._file.fileno())
@@ -135,6 +147,14 @@ class FileWriter:
         finally:
             os.close(self._source)
             self._file.close()
+
+    def empty(self) -> None:
+        """Wait until the pipe is empty, and what was in it is in the file."""
+        while not self.error:
+            with self._pumping:
+                if not select.select([self._source], [], [], 0.0)[0]:
+                    return
+            time.sleep(1e-3)
 
     def check(self) -> None:
         """Raise what went wrong, if anything.
@@ -198,7 +218,7 @@ class LiveView:
         self.url = f"rerun+http://127.0.0.1:{port}/proxy"
         self.dropped = 0
         self._delivered = False
-        self.stream = _stream(identity, 0.02)
+        self.stream = _stream(identity, _LIVE_TICK)
         self.stream.set_sinks(
             rr.GrpcServerSink(bind_ip="127.0.0.1", port=port, server_memory_limit=LIVE_MEMORY),
             default_blueprint=blueprint,
@@ -244,6 +264,7 @@ class RerunView:
         port: int | None = None,
         every: int = 1,
         properties: dict[str, Any] | None = None,
+        checkpoint: int | None = None,
     ):
         """Open the file, the live view or both, and show what never changes.
 
@@ -253,12 +274,13 @@ class RerunView:
             port: loopback port to serve a live view at.
             every: particles are shown each so many frames; plots have every frame.
             properties: kept with the recording: what program and machine it came from.
+            checkpoint: the file has all up to each so many frames when `on_frame` is back.
 
         Raises:
             InputError: the file cannot be opened, the port is taken, or Rerun is switched off.
         """
         scene = simulation.scene
-        self.every = every
+        self.every, self._checkpoint = every, checkpoint
         self._radius = 0.5 * scene.discretization.spacing
         self._volume = simulation.derived.blood_particles * scene.discretization.spacing**3
         # Free fall over the whole height: little is faster.
@@ -275,7 +297,7 @@ class RerunView:
         if port is not None:
             self.live = LiveView(port, identity, blueprint)
         if path is not None:
-            self._file = _stream(identity, 0.1)
+            self._file = _stream(identity, _FILE_TICK)
             if not rr.is_enabled(self._file):
                 raise InputError("--rrd: the environment variable RERUN switches recordings off")
             self._writer = FileWriter(path)
@@ -439,8 +461,9 @@ class RerunView:
         """
         items, self._notes = self._notes, []
         if frame % self.every == 0:
-            colours, _ = speed_colours(simulation.velocities(), self.full_scale)
-            points = rr.Points3D(simulation.positions(), colors=colours, radii=self._radius)
+            position, velocity = simulation.positions_and_velocities()
+            colours, _ = speed_colours(velocity, self.full_scale)
+            points = rr.Points3D(position, colors=colours, radii=self._radius)
             items.append(("world/blood", points))
             items += self._surgery(simulation)
             if self._wall is not None:
@@ -474,6 +497,11 @@ class RerunView:
         if self._file and self._writer:
             self._writer.check()
             _send(self._file, frame, figures.time, items)
+            if self._checkpoint and frame % self._checkpoint == 0:
+                with contextlib.suppress(RuntimeError):  # the writer knows why
+                    self._file.flush(timeout_sec=_CLOSE_TIMEOUT)
+                self._writer.empty()
+                self._writer.check()
         if self.live:
             self.live.offer(frame, figures.time, items)
 

@@ -76,6 +76,8 @@ class Exits:
             longest: drops are forgotten after this time [s].
         """
         n = min(int(self.drop_count[None]), MOST_DROPS)
+        if n == 0:
+            return np.zeros((0, 3), number())
         age = time - self.drop_time.to_numpy()[:n]
         recent = (age >= 0.0) & (age < longest)
         age = age[recent, None]

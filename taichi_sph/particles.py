@@ -83,6 +83,14 @@ class Particles:
         order = np.argsort(self.identity.to_numpy()[:n])
         return field.to_numpy()[:n][order]
 
+    def live(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Copies of identities (n,), positions [m] and velocities [m/s], (n, 3), as `copy_to`."""
+        n = int(self.count[None])
+        identity = np.empty(n, np.int32)
+        position, velocity = (np.empty((n, 3), number()) for _ in range(2))
+        self.copy_to(identity, position, velocity)
+        return identity, position, velocity
+
     def copy_to(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> int:
         """Copy the live rows into arrays of the caller, in one pass, in the order of the grid.
 

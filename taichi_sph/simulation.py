@@ -424,6 +424,12 @@ class Simulation(Motion):
         """Velocities of the live blood [m/s], shape (n, 3), in order of identity."""
         return self.particles.in_order(self.particles.velocity)
 
+    def positions_and_velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both in one pass: [m] and [m/s], (n, 3), in order of identity."""
+        identity, position, velocity = self.particles.live()
+        order = np.argsort(identity)
+        return position[order], velocity[order]
+
     def identities(self) -> np.ndarray:
         """Identities of the live blood, ascending, shape (n,)."""
         return self.particles.identities()

@@ -1,5 +1,6 @@
 """A rigid tool: a closed surface sampled as proxies, moved from outside, felt by the blood."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,16 +135,17 @@ class Tool:
     def aim(self) -> None:
         """Choose the velocity for the next step."""
         away = self.wanted_position - self.position
-        turn = (self.wanted_rotation * self.rotation.inv()).as_rotvec()
-        radius = self.shape.radius if self.shape else 0.0
         self.velocity = self._bounded(away, 1.0)
-        self.spin = self._bounded(turn, radius)
+        self.spin = np.zeros(3)
+        if self.wanted_rotation is not self.rotation:
+            turn = (self.wanted_rotation * self.rotation.inv()).as_rotvec()
+            self.spin = self._bounded(turn, self.shape.radius if self.shape else 0.0)
         if self.at_rest:
             self._reached = self.wanted_position, self.wanted_rotation
 
     @staticmethod
     def _bounded(way: Floats, arm: float) -> Floats:
-        length = float(np.linalg.norm(way))
+        length = math.hypot(*way)
         if length * max(arm, 1e-3) < 1e-7:
             return np.zeros(3)
         speed = length / FOLLOWING
@@ -152,11 +154,11 @@ class Tool:
     def move(self, dt: float) -> float:
         """Move by a step of dt [s]; returns how far a proxy may have gone [m]."""
         self.position = self.position + dt * self.velocity
-        radius = 0.0
         if self.spin.any():
             self.rotation = Rotation.from_rotvec(dt * self.spin) * self.rotation
-            radius = self.shape.radius if self.shape else 0.0
-        return dt * float(np.linalg.norm(self.velocity) + radius * np.linalg.norm(self.spin))
+        if self.shape is None:
+            return 0.0  # no proxy, so the lists need not be built for it
+        return dt * (math.hypot(*self.velocity) + self.shape.radius * math.hypot(*self.spin))
 
     def place(self, wall: Wall, neighbors: Neighbors) -> None:
         """Put the proxies into the wall's last rows."""

@@ -61,8 +61,8 @@ class FakeSimulation:
     def positions(self) -> np.ndarray:
         return (self.start + self.time * self.velocity).astype(np.float32)
 
-    def velocities(self) -> np.ndarray:
-        return self.velocity
+    def positions_and_velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.positions(), self.velocity
 
     def diagnostics(self) -> Diagnostics:
         return Diagnostics(

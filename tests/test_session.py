@@ -295,7 +295,7 @@ def test_a_session_is_replayed_bit_for_bit(kept):
 
 
 def test_a_replay_notices_another_course(kept, tmp_path):
-    changed = (kept / "s.jsonl").read_text().replace('"vector": [3.0', '"vector": [3.1')
+    changed = (kept / "s.jsonl").read_text().replace('"vector":[3.0', '"vector":[3.1')
     (tmp_path / "s.jsonl").write_text(changed)
     error = vesselflow(tmp_path, "replay", "s.jsonl", code=1)
     assert "differs from frame" in error.splitlines()[-1]

@@ -136,7 +136,7 @@ def test_kill_leaves_a_recording_to_about_the_last_second(tmp_path: Path) -> Non
     file = tmp_path / "run.rrd"
     with start_fake(file, 10_000, 500) as program:
         wait_for_frame(program, 20)
-        time.sleep(1.0)
+        time.sleep(2.0)
         program.kill()
     assert verify(file, footers=False)
     with pytest.warns(match="footer|manifest"):
@@ -146,6 +146,20 @@ def test_kill_leaves_a_recording_to_about_the_last_second(tmp_path: Path) -> Non
     assert len(found) >= 21
     assert sorted(found) == list(range(len(found)))
     assert abs(len(figures) - len(found)) <= 1
+
+
+def test_at_a_checkpoint_the_file_has_all_so_far(simulation: Any, tmp_path: Path) -> None:
+    file, copy = tmp_path / "run.rrd", tmp_path / "copy.rrd"
+    view = RerunView(simulation, file, checkpoint=4)
+    for frame in range(6):
+        simulation.advance_to(0.01 * frame)
+        view.on_frame(simulation, frame, simulation.diagnostics())
+        if frame == 4:
+            copy.write_bytes(file.read_bytes())
+    view.close("tested")
+    assert sorted(positions(file)) == [0, 1, 2, 3, 4, 5]
+    with pytest.warns(match="footer|manifest"):
+        assert sorted(positions(copy)) == [0, 1, 2, 3, 4]
 
 
 def test_a_full_disk_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
