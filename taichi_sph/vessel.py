@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_sph import filling, passage, surface, wall_sampling
 from taichi_sph.errors import InputError
+from taichi_sph.interior import Interior
 from taichi_sph.openings import (
     Candidate,
     Opening,
@@ -74,6 +75,10 @@ class Vessel:
     @cached_property
     def _nearest(self) -> surface.Nearest:
         return surface.Nearest(self.vertices, self._triangles)
+
+    @cached_property
+    def _interior(self) -> Interior:
+        return Interior(*self.bounds, self.volume, self.signed_distance)
 
     @cached_property
     def wall_faces(self) -> Integers:
@@ -149,6 +154,7 @@ class Vessel:
             tolerance: A point this close to the surface counts as within [m].
         """
         points = np.asarray(points, np.float64)
+        points = points[~self._interior.holds(points)]
         outside = points[~self.contains(points)]
         for opening in self.openings:
             if opening.is_open:

@@ -244,13 +244,13 @@ def test_there_is_room_for_the_blood_of_the_widest_lumen(pulsing):
 
 
 def test_a_shut_vessel_takes_in_and_gives_back_what_its_wall_makes_room_for(sim):
-    sim.advance_to(2.5 * BEAT)
+    sim.advance_to(1.5 * BEAT)
     wide = int((sim.identities() >= 0).sum())
     assert sim.wall.level == pytest.approx(1.0)
     figures = sim.diagnostics()
     assert figures.leaks == 0
     assert figures.compression_p99 < 0.03
-    sim.advance_to(3.0 * BEAT)
+    sim.advance_to(2.0 * BEAT)
     narrow = int((sim.identities() >= 0).sum())
     assert sim.wall.level == pytest.approx(0.0, abs=1e-9)
     assert sim.diagnostics().leaks == 0

@@ -21,6 +21,7 @@ from meshes import (
 )
 from taichi_sph import surface, wall_sampling
 from taichi_sph.errors import InputError
+from taichi_sph.interior import Interior
 from taichi_sph.scene import Column, OpeningTable, read_scene
 from taichi_sph.vessel import Vessel, build_vessel, check_vessel, read_vessel
 
@@ -70,6 +71,22 @@ def test_signed_distance_of_a_cylinder() -> None:
         np.maximum(radial, 0), np.maximum(axial, 0)
     )
     assert np.abs(vessel.signed_distance(points) - exact).max() < 3e-6
+
+
+def test_boxes_called_inside_are_and_most_of_the_lumen_is_in_such(aorta: Vessel) -> None:
+    low, high = aorta.bounds
+    interior = Interior(low, high, aorta.volume, aorta.signed_distance)
+    random = np.random.default_rng(2)
+    for _ in range(2):  # asked for the first time, and known
+        points = random.uniform(low - 2e-3, high + 2e-3, (20_000, 3))
+        points[:2] = low, high
+        held, depth = interior.holds(points), -aorta.signed_distance(points)
+        assert depth[held].min() > 0.0
+        # A box whose middle is deeper than its half diagonal reaches half a diagonal deeper.
+        deep = depth > math.sqrt(3.0) * 1.001 * interior.size
+        assert deep.sum() > 100
+        assert held[deep].all()
+        assert not held[~aorta.contains(points)].any()
 
 
 # Openings
