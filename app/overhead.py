@@ -60,7 +60,7 @@ class Overhead:
 
 
 def measure_overhead(
-    scene: Scene, weights: Path, arch: str, threads: int | None, folder: Path
+    scene: Scene, weights: Path, arch: str, threads: int | None, folder: Path, pairs: int = PAIRS
 ) -> Overhead:
     """Run a scene by PcNet, frames with and without control in turn.
 
@@ -83,7 +83,7 @@ def measure_overhead(
         client.start()
         while not session.watched:
             time.sleep(0.1)
-        for pair in range(-1, PAIRS):
+        for pair in range(-1, pairs):
             if pair % PAIRS_A_POUR == 0:
                 simulation.reset()
             for acted in (False, True) if pair % 2 else (True, False):
