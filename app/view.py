@@ -44,8 +44,8 @@ LIVE_MEMORY = "64MiB"
 """What the server keeps of the past for viewers that come late; it takes twice that."""
 _BATCH = 64 << 20
 """Bytes of a batch: with the default small rows starve beside large ones."""
-_FILE_TICK = 1.0
-"""Between two writes to the file [s]: of each Rerun remembers some 4 kB for the file's end."""
+_FILE_TICK = 5.0
+"""Between two writes to the file [s]: for its end Rerun remembers 1 kB of each, times ten entities."""
 _LIVE_TICK = 0.02
 """Between two messages to viewers [s]."""
 _CLOSE_TIMEOUT = 60.0
