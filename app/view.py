@@ -45,7 +45,7 @@ LIVE_MEMORY = "64MiB"
 _BATCH = 64 << 20
 """Bytes of a batch: with the default small rows starve beside large ones."""
 _FILE_TICK = 5.0
-"""Between two writes to the file [s]: for its end Rerun remembers 1 kB of each, times ten entities."""
+"""Between two writes to the file [s]: of each Rerun remembers 10 kB for the file's end."""
 _LIVE_TICK = 0.02
 """Between two messages to viewers [s]."""
 _CLOSE_TIMEOUT = 60.0
