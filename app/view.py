@@ -45,7 +45,7 @@ LIVE_MEMORY = "64MiB"
 _BATCH = 64 << 20
 """Bytes of a batch: with the default small rows starve beside large ones."""
 _FILE_TICK = 2.0
-"""Between two writes to the file, or half that [s]: Rerun remembers 10 kB of each for its end."""
+"""A write follows the last by this or twice this [s]; Rerun remembers 10 kB of each for the end."""
 _LIVE_TICK = 0.02
 """Between two messages to viewers [s]."""
 _CLOSE_TIMEOUT = 60.0
