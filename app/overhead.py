@@ -1,6 +1,7 @@
 """What live control and a live view cost a run, for `vesselflow bench --control`."""
 
 import multiprocessing
+import os
 import socket
 import statistics
 import threading
@@ -27,10 +28,14 @@ from taichi_sph.simulation import Simulation
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Event
 
-PAIRS = 48
-"""Of frames, one bare and one acted on; which is first changes from pair to pair."""
-PAIRS_A_POUR = 8
+PAIRS = 24
+"""Of stretches, one bare and one acted on; which is first changes from pair to pair."""
+FRAMES = 3
+"""Of a stretch: what threads still do of one falls into the next."""
+PAIRS_A_POUR = 4
 """Then the blood begins again, for with less of it left a step costs less."""
+_PATIENCE = 60.0
+"""Longest wait for the client [s]."""
 COMMANDS = 50.0
 """That a client sends in a second: a hand on the tool [1/s]."""
 
@@ -62,7 +67,7 @@ class Overhead:
 def measure_overhead(
     scene: Scene, weights: Path, arch: str, threads: int | None, folder: Path, pairs: int = PAIRS
 ) -> Overhead:
-    """Run a scene by PcNet, frames with and without control in turn.
+    """Run a scene by PcNet, stretches of frames with and without control in turn.
 
     A client in a process of its own sends commands and takes what the page sends.  What a browser
     needs to draw that is not counted, nor is a viewer.
@@ -81,33 +86,39 @@ def measure_overhead(
             target=_act, args=(channel.port, page.port, place, acting, done), daemon=True
         )
         client.start()
+        end = time.monotonic() + _PATIENCE
         while not session.watched:
+            if time.monotonic() > end or not client.is_alive():
+                raise RuntimeError("bench --control: its own client does not reach the page")
             time.sleep(0.1)
         for pair in range(-1, pairs):
             if pair % PAIRS_A_POUR == 0:
                 simulation.reset()
             for acted in (False, True) if pair % 2 else (True, False):
+                sent, steps, began = page.pictures, simulation.steps, time.perf_counter()
                 if acted:
-                    session.before_step()  # what came too late for the last frame
-                    session.latency = 0.0
+                    session.before_step()
+                    session.latency = 0.0  # what came too late for the last stretch waited long
                     acting.set()
                 else:
                     acting.clear()
-                frame, sent = frame + 1, page.pictures
-                steps, began = simulation.steps, time.perf_counter()
-                simulation.advance_to(
-                    simulation.time + scene.frame_interval, session.before_step if acted else None
-                )
-                figures = simulation.diagnostics()
-                if acted:
-                    session.on_frame(simulation, frame, figures)
-                    view.on_frame(simulation, frame, figures)
+                    session.watched = False
+                for _ in range(FRAMES):
+                    frame += 1
+                    simulation.advance_to(
+                        simulation.time + scene.frame_interval,
+                        session.before_step if acted else None,
+                    )
+                    figures = simulation.diagnostics()
+                    if acted:
+                        session.on_frame(simulation, frame, figures)
+                        view.on_frame(simulation, frame, figures)
                 took = time.perf_counter() - began
                 if pair < 0:
                     continue  # the first of each compile
                 sides[acted].append(1e3 * took / (simulation.steps - steps))
                 if acted:
-                    frame_times.append(took)
+                    frame_times.append(took / FRAMES)
                     latency = max(latency, session.latency)
                     pictures += page.pictures - sent
         done.set()
@@ -120,7 +131,8 @@ def measure_overhead(
     return Overhead(
         scene.name, simulation.derived.blood_particles,
         statistics.median(sides[False]), statistics.median(sides[True]), middle, low, high,
-        1e3 * statistics.median(frame_times), 1e3 * latency, pictures / sum(frame_times),
+        1e3 * statistics.median(frame_times), 1e3 * latency,
+        pictures / (FRAMES * sum(frame_times)),
     )  # fmt: skip
 
 
@@ -150,6 +162,7 @@ def _look(port: int) -> None:
     """Take all that a page sends; it sends pictures to whoever has said where the camera is."""
     from websockets.sync.client import connect
 
+    os.environ["NO_PROXY"] = "127.0.0.1"
     nowhere = (0.0, 0.0, 0.0)
     camera = {
         "type": "ViewerCameraMessage", "wxyz": (1.0, *nowhere), "position": nowhere,

@@ -207,7 +207,7 @@ class ControlPage:
         self._closing = threading.Event()
         self.pictures = 0
         """Shown so far."""
-        self._time: float | None = None
+        self._shown: Picture | None = None
         self._wounds: dict[int, Wound] = {}
         self._rims: list[Any] = []
         self._server = start_server(listener)
@@ -391,11 +391,11 @@ class ControlPage:
                     self._figures.content = figures_table(figures)
             if now < next_frame - _PERIOD:
                 continue
-            picture = self._session.picture()  # asked for before it is needed, so that it is fresh
+            # Asked for before it is due.
+            picture = self._session.picture(self._shown)
             if picture is not None and now >= next_frame:
                 began = time.thread_time()
                 self._show(picture)
-                self.pictures += 1
                 next_frame = now + (time.thread_time() - began) / _SHARE
 
     def _hand_on(self) -> None:
@@ -419,8 +419,9 @@ class ControlPage:
                 client.add_notification("Refused", text, auto_close_seconds=_SHOWN, color="red")
 
     def _show(self, picture: "Picture") -> None:
-        if picture.time != self._time:
-            self._time = picture.time
+        if picture is not self._shown:
+            self._shown = picture
+            self.pictures += 1
             packed, _ = speed_colours(picture.velocities, self._full_scale)
             colours = packed.astype(">u4").view(np.uint8).reshape(-1, 4)[:, :3]
             with self._server.atomic():

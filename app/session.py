@@ -195,10 +195,12 @@ class Session:
         # A frame may take long: the clock goes on meanwhile.
         return self._figures | now | ({"time": self.simulation.time} if self._figures else {})
 
-    def picture(self) -> Picture | None:
-        """What was last seen of the blood, if anything; who asks has the next one taken."""
-        self.watched = True
-        return self._picture
+    def picture(self, known: Picture | None) -> Picture | None:
+        """What was last seen of the blood, if anything; for who knows it, the next is taken."""
+        picture = self._picture
+        if picture is known:
+            self.watched = True
+        return picture
 
     # What the run's own thread calls.
 
@@ -394,7 +396,8 @@ class Session:
         if self._log is not None:
             try:
                 # Of json's time msgspec takes a third, and a hand moves the tool 50 times a second.
-                self._log.write(msgspec.json.encode(line, enc_hook=float) + b"\n")
+                text = msgspec.json.encode(line, enc_hook=lambda value: value.item())
+                self._log.write(text + b"\n")
                 self._log.flush()
             except OSError as error:
                 raise OSError(
@@ -408,7 +411,8 @@ class Session:
             OSError: it cannot be written.
         """
         try:
-            self._write({"end": ending})
+            # A file's name may be in it, in whatever encoding.
+            self._write({"end": ending.encode(errors="replace").decode()})
         finally:
             if self._log is not None:
                 self._log.close()
@@ -464,7 +468,7 @@ def read_script(path: Path) -> list[tuple[float, AnyCommand]]:
 
 def _lines(path: Path, option: str) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8").removesuffix("\n").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise InputError(f"{option} {path}: cannot be read: {reason}") from None

@@ -4,7 +4,6 @@ File and live view are two streams.  Rerun blocks a stream whose viewer has stal
 one has a thread and a short queue that drops frames, and nothing waits for it.  The file has all.
 """
 
-import contextlib
 import errno
 import os
 import queue
@@ -48,8 +47,8 @@ _FILE_TICK = 2.0
 """A write follows the last by this or twice this [s]; Rerun remembers 10 kB of each for the end."""
 _LIVE_TICK = 0.02
 """Between two messages to viewers [s]."""
-_CLOSE_TIMEOUT = 60.0
-"""Longest wait for the disk at the end [s]."""
+_TIMEOUT = 60.0
+"""Longest wait for the disk, at a checkpoint and at the end [s]."""
 _LIVE_TIMEOUT = 2.0
 """Longest wait for a viewer at the end [s]."""
 _LIVE_QUEUE = 4
@@ -129,7 +128,7 @@ class FileWriter:
     def _pump(self) -> None:
         data = b"all"
         while data:
-            select.select([self._source], [], [])
+            self._waits(None)
             with self._pumping:
                 data = os.read(self._source, 1 << 20)
                 rest = memoryview(data)
@@ -148,13 +147,33 @@ class FileWriter:
             os.close(self._source)
             self._file.close()
 
+    def _waits(self, patience: int | None) -> bool:
+        """Whether bytes are in the pipe, or come before so long [ms], or it is closed."""
+        asked = select.poll()
+        asked.register(self._source, select.POLLIN)
+        return bool(asked.poll(patience))
+
     def empty(self) -> None:
-        """Wait until the pipe is empty, and what was in it is in the file."""
-        while not self.error:
-            with self._pumping:
-                if not select.select([self._source], [], [], 0.0)[0]:
+        """Wait until the pipe is empty and what was in it is in the file, or cannot be.
+
+        Raises:
+            OSError: the disk does not answer.
+        """
+        end = time.monotonic() + _TIMEOUT
+        while self._thread.is_alive() and not self.error:
+            if self._pumping.acquire(timeout=_TIMEOUT):
+                waiting = self._waits(0)
+                self._pumping.release()
+                if not waiting:
                     return
+            if time.monotonic() > end:
+                raise self.silent
             time.sleep(1e-3)
+
+    @property
+    def silent(self) -> OSError:
+        """What is said of a disk that does not answer."""
+        return OSError(f"{self.path}: the disk has not answered for {_TIMEOUT:g} s")
 
     def check(self) -> None:
         """Raise what went wrong, if anything.
@@ -174,9 +193,9 @@ class FileWriter:
         Raises:
             OSError: as `check`, or the disk does not answer.
         """
-        self._thread.join(_CLOSE_TIMEOUT)
+        self._thread.join(_TIMEOUT)
         if self._thread.is_alive():
-            raise OSError(f"{self.path}: the disk has not answered for {_CLOSE_TIMEOUT:g} s")
+            raise self.silent
         self.check()
 
 
@@ -498,10 +517,13 @@ class RerunView:
             self._writer.check()
             _send(self._file, frame, figures.time, items)
             if self._checkpoint and frame % self._checkpoint == 0:
-                with contextlib.suppress(RuntimeError):  # the writer knows why
-                    self._file.flush(timeout_sec=_CLOSE_TIMEOUT)
+                # A full disk is said at the next frame, for the checkpoint can still be written.
+                try:
+                    self._file.flush(timeout_sec=_TIMEOUT)
+                except RuntimeError:
+                    if not self._writer.error:
+                        raise self._writer.silent from None
                 self._writer.empty()
-                self._writer.check()
         if self.live:
             self.live.offer(frame, figures.time, items)
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from taichi_sph.surface import Booleans, Floats
 
+MOST_BOXES = 20_000_000
+"""Of the whole lattice, a byte each: a thin vessel fills little of its bounds."""
 BOXES = 30_000
 """That fill the lumen: smaller ones hold more of the blood, and more have to be asked about."""
 
@@ -34,7 +36,8 @@ class Interior:
             signed_distance: of points (k, 3) to the surface [m], negative inside, (k,).
         """
         self._low, self._signed_distance = low, signed_distance
-        self.size = (volume / BOXES) ** (1.0 / 3.0)
+        bounds = float(np.prod(high - low))
+        self.size = max(volume / BOXES, bounds / MOST_BOXES) ** (1.0 / 3.0)
         """Edge of a box [m]."""
         self._shape = np.ceil((high - low) / self.size).astype(int)
         self._known = np.zeros(self._shape.prod(), np.int8)

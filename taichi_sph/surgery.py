@@ -263,7 +263,7 @@ class Surgery:
         self._sucked_until = time
 
     def before_drift(self, dt: float) -> float:
-        """Move the tool by a step of dt [s]; returns how far a proxy of it may have gone [m]."""
+        """Move the tool by a step of dt [s]; returns how far the lists have to reach for it [m]."""
         if self.tool.settled:
             return 0.0
         moved = not self.tool.at_rest
@@ -272,7 +272,8 @@ class Surgery:
             return 0.0
         way = self.tool.move(dt)
         self.tool.place(self.wall, self.neighbors)
-        return way
+        # Suction takes blood when the lists are built; a mere point has no proxies in them.
+        return way if self.tool.shape or self.suction_rate > 0.0 else 0.0
 
     def start_again(self, time: float) -> None:
         """As at the start, at a time [s]."""

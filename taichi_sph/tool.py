@@ -152,13 +152,12 @@ class Tool:
         return way / length * min(speed, 0.5 * LARGEST_SPEED / max(arm, 1e-3))
 
     def move(self, dt: float) -> float:
-        """Move by a step of dt [s]; returns how far a proxy may have gone [m]."""
+        """Move by a step of dt [s]; returns how far a part of it may have gone [m]."""
         self.position = self.position + dt * self.velocity
         if self.spin.any():
             self.rotation = Rotation.from_rotvec(dt * self.spin) * self.rotation
-        if self.shape is None:
-            return 0.0  # no proxy, so the lists need not be built for it
-        return dt * (math.hypot(*self.velocity) + self.shape.radius * math.hypot(*self.spin))
+        radius = self.shape.radius if self.shape else 0.0
+        return dt * (math.hypot(*self.velocity) + radius * math.hypot(*self.spin))
 
     def place(self, wall: Wall, neighbors: Neighbors) -> None:
         """Put the proxies into the wall's last rows."""

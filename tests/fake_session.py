@@ -113,7 +113,7 @@ class FakeSession:
                 "frames": self.pictures,
             }
 
-    def picture(self) -> Any:
+    def picture(self, known: Any) -> Any:
         self.pictures += 1
         if not self.state["paused"]:
             self.last = time.monotonic() - self.start

@@ -30,13 +30,13 @@ def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for
 def test_what_control_costs_is_measured_with_a_hand_and_an_eye_on_the_run(tmp_path):
     scene = read_scene(scene_path("tube"))
     found = in_own_process(measure_overhead, scene, weights_for(scene), "cpu", 1, tmp_path, 2)
+    assert found.blood_particles == 3920
     assert found.latency_ms > 0.0
     assert found.pictures > 0.0
-    assert found.more_low <= found.more <= found.more_high
     log = [json.loads(line) for line in (tmp_path / "session.jsonl").read_text().splitlines()]
     moved = [row["do"]["command"] for row in log if "do" in row]
     assert set(moved) == {"tool"}
-    assert sum("frame" in row for row in log) == 3  # those acted on, the first compiles
+    assert sum("frame" in row for row in log) == 9  # those acted on, the first compiles
 
 
 def test_a_peer_that_is_not_installed_is_one_sentence(monkeypatch):

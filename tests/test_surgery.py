@@ -472,6 +472,17 @@ def test_suction_that_reaches_no_blood_owes_none(sim):
     assert int(sim.exits.account()[SUCTION]) <= 1 + math.ceil(1e-4 * 0.004 / OF_ONE * 0.1)
 
 
+def test_a_mere_tip_has_the_lists_built_only_where_it_sucks(sim, monkeypatch):
+    tool = Tool(None, sim.surgery.tool.position)
+    monkeypatch.setattr(sim.surgery, "tool", tool)
+    sim.move_tool(tool.position + [0.0, 0.0, 1e-3])
+    assert sim.surgery.before_drift(1e-3) == 0.0
+    sim.suck(1e-6)
+    before = tool.position
+    assert sim.surgery.before_drift(1e-3) == pytest.approx(np.linalg.norm(tool.position - before))
+    assert not np.array_equal(tool.position, before)
+
+
 def state_of(sim: Simulation) -> tuple[list[np.ndarray], dict]:
     """All that is to be the same bit by bit."""
     kept = sim.snapshot()

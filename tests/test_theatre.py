@@ -70,7 +70,7 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         browser.find("//*[contains(., 'Software')]//button[1]").click()
         browser.press("hold")
         wait_until(lambda: session.paused)
-        wait_until(lambda: getattr(session.picture(), "time", None) == simulation.time)
+        wait_until(lambda: getattr(session.picture(None), "time", None) == simulation.time)
         steps = simulation.steps
         browser.press("one step")
         wait_until(lambda: simulation.steps == steps + 1)

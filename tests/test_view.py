@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any, cast
 
 import numpy as np
@@ -148,9 +149,18 @@ def test_kill_leaves_a_recording_to_about_the_last_five_seconds(tmp_path: Path) 
     assert abs(len(figures) - len(found)) <= 1
 
 
-def test_at_a_checkpoint_the_file_has_all_so_far(simulation: Any, tmp_path: Path) -> None:
+def test_at_a_checkpoint_the_file_has_all_so_far(tmp_path: Path) -> None:
     file, copy = tmp_path / "run.rrd", tmp_path / "copy.rrd"
+    simulation: Any = FakeSimulation(20_000)
     view = RerunView(simulation, file, checkpoint=4)
+    writer: Any = view._writer
+    disk = writer._file
+
+    def slowly(data: memoryview) -> int:
+        time.sleep(0.02)  # the pipe holds a part of a frame only
+        return disk.write(data)
+
+    writer._file = SimpleNamespace(write=slowly, fileno=disk.fileno, close=disk.close)
     for frame in range(6):
         simulation.advance_to(0.01 * frame)
         view.on_frame(simulation, frame, simulation.diagnostics())
