@@ -22,9 +22,10 @@ import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
+from taichi_sph.errors import InputError
 from taichi_sph.openings import Opening
 from taichi_sph.particles import Particles
-from taichi_sph.runtime import number
+from taichi_sph.runtime import has_wide_atomics, number
 from taichi_sph.surface import Floats, Integers, inside_polygon, plane_axes
 from taichi_sph.waveform import Waveform
 
@@ -228,7 +229,16 @@ class Pistons:
     def __init__(
         self, pistons: list[Piston], spacing: float, support_radius: float, density: float
     ):
-        """Make the fields; spacing [m], support radius [m] and rest density [kg/m^3] of blood."""
+        """Make the fields; spacing [m], support radius [m] and rest density [kg/m^3] of blood.
+
+        Raises:
+            InputError: there are some, and this device cannot sum what acts on them.
+        """
+        if pistons and not has_wide_atomics():
+            raise InputError(
+                "driven openings need sums of 64-bit integers, which of GPUs only CUDA's have; "
+                "use --arch cpu"
+            )
         self.each = pistons
         self.spacing = spacing
         self.density = density

@@ -83,3 +83,8 @@ def start(
         _pin(sorted(_threads() - others)[-ti.cfg.cpu_max_num_threads :])
     if arch == "gpu" and ti.cfg.arch in (ti.x64, ti.arm64):
         raise InputError("--arch gpu: no CUDA or Metal device was found; use --arch cpu")
+
+
+def has_wide_atomics() -> bool:
+    """Whether sums of 64-bit integers are right: Metal has none, Vulkan got them wrong."""
+    return ti.cfg.arch in (ti.x64, ti.arm64, ti.cuda)

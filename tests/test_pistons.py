@@ -569,3 +569,9 @@ def test_where_a_scene_lies_does_not_matter(tmp_path: Path) -> None:
 
     (piston,) = make_pistons(scene, read_vessel(scene))
     assert piston.waveform(0.5) == 1.5
+
+
+def test_a_device_without_sums_of_wide_integers_is_refused(driven, monkeypatch):
+    monkeypatch.setattr("taichi_sph.pistons.has_wide_atomics", lambda: False)
+    with pytest.raises(InputError, match=r"^driven openings need .* use --arch cpu$"):
+        Simulation(driven.scene, driven.vessel)
