@@ -236,7 +236,7 @@ class Pistons:
         """
         if pistons and not has_wide_atomics():
             raise InputError(
-                "driven openings need sums of 64-bit integers, which of GPUs only CUDA's have; "
+                "driven openings need sums of 64-bit integers, which Metal does not have; "
                 "use --arch cpu"
             )
         self.each = pistons
@@ -256,7 +256,11 @@ class Pistons:
         count = max(1, len(pistons))
         self.speed = ti.field(float, count)
         """u of each plug [m/s]."""
-        self.thrust = ti.field(ti.i64, count)
+        self.thrust = ti.field(ti.i64)
+        # In a tree of its own: among 32-bit fields it overlaps them on Vulkan.
+        alone = ti.FieldsBuilder()
+        alone.dense(ti.i, count).place(self.thrust)
+        alone.finalize()
         """Sum of the accelerations into the vessel over a plug [1/FINE m/s^2]."""
         self.members = ti.field(int, count)
         """Particles of each plug."""
