@@ -32,8 +32,8 @@ PAIRS = 24
 """Of stretches, one bare and one acted on; which is first changes from pair to pair."""
 FRAMES = 3
 """Of a stretch: what threads still do of one falls into the next."""
-PAIRS_A_POUR = 4
-"""Then the blood begins again, for with less of it left a step costs less."""
+SETTLED = 3
+"""Frames before the first of them, that compile."""
 _PATIENCE = 60.0
 """Longest wait for the client [s]."""
 COMMANDS = 50.0
@@ -91,10 +91,12 @@ def measure_overhead(
             if time.monotonic() > end or not client.is_alive():
                 raise RuntimeError("bench --control: its own client does not reach the page")
             time.sleep(0.1)
+        simulation.advance_to(SETTLED * scene.frame_interval)
+        state = simulation.snapshot()
         for pair in range(-1, pairs):
-            if pair % PAIRS_A_POUR == 0:
-                simulation.reset()
             for acted in (False, True) if pair % 2 else (True, False):
+                # Both do the same work: a tool without a shape moves no blood.
+                simulation.go_on_from(state)
                 sent, steps, began = page.pictures, simulation.steps, time.perf_counter()
                 if acted:
                     session.before_step()
