@@ -266,14 +266,17 @@ class Surgery:
         """Move the tool by a step of dt [s]; returns how far the lists have to reach for it [m]."""
         if self.tool.settled:
             return 0.0
+        if self.tool.shape is None:
+            way = self.tool.jump()
+            # Suction takes blood when the lists are built.
+            return way if self.suction_rate > 0.0 else 0.0
         moved = not self.tool.at_rest
         self.tool.aim()
         if self.tool.at_rest and not moved:
             return 0.0
         way = self.tool.move(dt)
         self.tool.place(self.wall, self.neighbors)
-        # Suction takes blood when the lists are built; a mere point has no proxies in them.
-        return way if self.tool.shape or self.suction_rate > 0.0 else 0.0
+        return way
 
     def start_again(self, time: float) -> None:
         """As at the start, at a time [s]."""

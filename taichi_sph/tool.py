@@ -133,15 +133,23 @@ class Tool:
         return self._reached[0] is wanted[0] and self._reached[1] is wanted[1]
 
     def aim(self) -> None:
-        """Choose the velocity for the next step."""
+        """Choose the velocity for the next step; of a tool with a shape, as `move`."""
+        assert self.shape is not None
         away = self.wanted_position - self.position
         self.velocity = self._bounded(away, 1.0)
         self.spin = np.zeros(3)
         if self.wanted_rotation is not self.rotation:
             turn = (self.wanted_rotation * self.rotation.inv()).as_rotvec()
-            self.spin = self._bounded(turn, self.shape.radius if self.shape else 0.0)
+            self.spin = self._bounded(turn, self.shape.radius)
         if self.at_rest:
             self._reached = self.wanted_position, self.wanted_rotation
+
+    def jump(self) -> float:
+        """Be where it is wanted, for a mere point pushes no blood; returns how far that is [m]."""
+        way = math.dist(self.position, self.wanted_position)
+        self.position, self.rotation = self.wanted_position, self.wanted_rotation
+        self._reached = self.wanted_position, self.wanted_rotation
+        return way
 
     @staticmethod
     def _bounded(way: Floats, arm: float) -> Floats:
@@ -156,8 +164,8 @@ class Tool:
         self.position = self.position + dt * self.velocity
         if self.spin.any():
             self.rotation = Rotation.from_rotvec(dt * self.spin) * self.rotation
-        radius = self.shape.radius if self.shape else 0.0
-        return dt * (math.hypot(*self.velocity) + radius * math.hypot(*self.spin))
+        assert self.shape is not None
+        return dt * (math.hypot(*self.velocity) + self.shape.radius * math.hypot(*self.spin))
 
     def place(self, wall: Wall, neighbors: Neighbors) -> None:
         """Put the proxies into the wall's last rows."""

@@ -555,14 +555,15 @@ def test_velocity_and_spin_are_the_motion_of_the_proxies(stage, shape):
     np.testing.assert_allclose(found, velocity[stage.wall.count :], rtol=0, atol=limit)
 
 
-def test_a_tool_without_a_shape_moves_as_a_point():
+def test_a_tool_without_a_shape_is_at_once_where_it_is_wanted():
     tool = Tool(None, np.array([1.0, 2.0, 3.0]))
     assert tool.count == 0
-    tool.wanted_position = np.array([1.0, 2.0, 3.001])
-    for _ in range(3000):
-        tool.aim()
-        assert tool.move(1e-4) <= LARGEST_SPEED * 1e-4
-    assert tool.position == pytest.approx(tool.wanted_position, abs=1e-6)
+    assert not tool.settled
+    tool.wanted_position = np.array([1.0, 2.003, 3.004])
+    assert tool.jump() == pytest.approx(0.005)
+    assert tool.position.tolist() == [1.0, 2.003, 3.004]
+    assert tool.settled
     tool.start_again()
     assert tool.position.tolist() == [1.0, 2.0, 3.0]
-    assert tool.at_rest
+    assert not tool.settled
+    assert tool.jump() == 0.0
