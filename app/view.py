@@ -19,8 +19,11 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("RUST_LOG", "off")
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+from rerun.blueprint.visualizers import Visualizer
 
 from app.appearance import (
     BACKGROUND,
@@ -60,31 +63,45 @@ _LABEL_DISTANCE = 0.4
 _NO_LABELS = 12
 """From this many openings on, their names would hide the vessel."""
 
-PLOTS: dict[str, tuple[str, tuple[tuple[str, tuple[int, int, int]], ...]]] = {
-    "speed": ("largest speed [m/s]", (("largest speed", (255, 170, 77)),)),
-    "energy": ("kinetic energy [mJ]", (("kinetic energy", (238, 85, 27)),)),
-    "compression": (
+Line = tuple[str, str, tuple[int, int, int]]
+"""Of a plot: its figure, its name and its colour."""
+
+PLOTS: tuple[tuple[str, tuple[Line, ...]], ...] = (
+    ("largest speed [m/s]", (("max_speed", "largest speed", (255, 170, 77)),)),
+    ("kinetic energy [mJ]", (("kinetic_energy", "kinetic energy", (238, 85, 27)),)),
+    (
         "compression [%]",
-        (("99th percentile", (120, 200, 255)), ("largest", (70, 110, 160))),
-    ),
-    "volume": (
-        "blood [ml]",
         (
-            ("in the vessel", (214, 43, 22)),
-            ("drained", (150, 150, 170)),
-            ("driven in", (110, 170, 255)),
-            ("bled", (255, 170, 77)),
-            ("sucked away", (140, 220, 140)),
+            ("compression_p99", "99th percentile", (120, 200, 255)),
+            ("compression_max", "largest", (70, 110, 160)),
         ),
     ),
-    "wall": (
-        "wall",
-        (("leaks", (255, 90, 200)), ("corrections since the start", (160, 130, 255))),
+    (
+        "blood [ml]",
+        (
+            ("in_vessel", "in the vessel", (214, 43, 22)),
+            ("drained", "drained", (150, 150, 170)),
+            ("driven_in", "driven in", (110, 170, 255)),
+            ("bled", "bled", (255, 170, 77)),
+            ("sucked", "sucked away", (140, 220, 140)),
+        ),
     ),
-    "step": ("time step [ms]", (("time step", (140, 220, 140)),)),
-    "guard": ("taken over by the physics [%]", (("of the time so far", (230, 190, 120)),)),
-}
-"""Plots by entity: title, and name and colour of each line."""
+    (
+        "wall",
+        (
+            ("leaks", "leaks", (255, 90, 200)),
+            ("wall_corrections", "corrections since the start", (160, 130, 255)),
+        ),
+    ),
+    ("time step [ms]", (("step", "time step", (140, 220, 140)),)),
+    (
+        "taken over by the physics [%]",
+        (("fallback_share", "of the time so far", (230, 190, 120)),),
+    ),
+)
+"""Plots by title.  Their figures are one row of one entity: of each entity that it writes Rerun
+remembers a kilobyte for the end of the file."""
+_FIGURES = pa.struct([(figure, pa.float64()) for _, lines in PLOTS for figure, *_ in lines])
 
 Items = list[tuple[str, Any]]
 
@@ -207,6 +224,17 @@ def _stream(identity: str, tick: float) -> rr.RecordingStream:
     )
     stream.set_log_time_enabled(False)
     return stream
+
+
+def _line(figure: str, name: str, colour: tuple[int, int, int]) -> Visualizer:
+    """A line of a plot."""
+    source = VisualizerComponentMapping(
+        "Scalars:scalars",
+        ComponentSourceKind.SourceComponent,
+        source_component="figures:values",
+        selector=f".{figure}",
+    )
+    return rr.SeriesLines(names=name, colors=[colour], widths=1.5).visualizer(mappings=[source])
 
 
 def _send(stream: rr.RecordingStream, frame: int, time: float, items: Items) -> None:
@@ -347,12 +375,13 @@ class RerunView:
         )
         plots = [
             rrb.TimeSeriesView(
-                origin=f"/plots/{entity}",
+                origin="/figures",
                 name=title,
+                overrides={"/figures": [_line(*line) for line in lines]},
                 # A single line is named by its title.
                 plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(lines) > 1),
             )
-            for entity, (title, lines) in PLOTS.items()
+            for title, lines in PLOTS
         ]
         return rrb.Blueprint(
             rrb.Horizontal(
@@ -451,16 +480,6 @@ class RerunView:
                 ),
                 static=True,
             )
-        for entity, (_, lines) in PLOTS.items():
-            stream.log(
-                f"plots/{entity}",
-                rr.SeriesLines(
-                    names=[name for name, _ in lines],
-                    colors=[list(colour) for _, colour in lines],
-                    widths=1.5,
-                ),
-                static=True,
-            )
         stream.log("scene", rr.TextDocument(self._document(simulation), media_type="text/markdown"))
 
     def _document(self, simulation: "Simulation") -> str:
@@ -490,28 +509,23 @@ class RerunView:
                 wall = narrow + simulation.wall.level * way
                 items.append(("world/vessel", rr.Mesh3D.from_fields(vertex_positions=wall)))
         in_vessel = figures.particles / max(1, simulation.derived.blood_particles) * self._volume
-        for entity, values in (
-            ("speed", [figures.max_speed]),
-            ("energy", [1e3 * figures.kinetic_energy]),
-            ("compression", [1e2 * figures.compression_p99, 1e2 * figures.compression_max]),
-            (
-                "volume",
-                [
-                    1e6 * volume
-                    for volume in (
-                        in_vessel,
-                        figures.drained_volume,
-                        figures.added_volume,
-                        figures.bled_volume,
-                        figures.sucked_volume,
-                    )
-                ],
-            ),
-            ("wall", [figures.leaks, figures.wall_corrections]),
-            ("step", [1e3 * figures.step]),
-            ("guard", [1e2 * figures.fallback_share]),
-        ):
-            items.append((f"plots/{entity}", rr.Scalars(values)))
+        values = {
+            "max_speed": figures.max_speed,
+            "kinetic_energy": 1e3 * figures.kinetic_energy,
+            "compression_p99": 1e2 * figures.compression_p99,
+            "compression_max": 1e2 * figures.compression_max,
+            "in_vessel": 1e6 * in_vessel,
+            "drained": 1e6 * figures.drained_volume,
+            "driven_in": 1e6 * figures.added_volume,
+            "bled": 1e6 * figures.bled_volume,
+            "sucked": 1e6 * figures.sucked_volume,
+            "leaks": figures.leaks,
+            "wall_corrections": figures.wall_corrections,
+            "step": 1e3 * figures.step,
+            "fallback_share": 1e2 * figures.fallback_share,
+        }
+        row = pa.array([values], type=_FIGURES)
+        items.append(("figures", rr.DynamicArchetype("figures", components={"values": row})))
         self._last = (frame, figures.time)
         if self._file and self._writer:
             self._writer.check()

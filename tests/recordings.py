@@ -56,9 +56,15 @@ def positions(path: Path) -> dict[int, np.ndarray]:
     return {frame: values.reshape(-1, 3) for frame, values in found.items()}
 
 
-def scalars(path: Path, plot: str) -> dict[int, np.ndarray]:
-    """Values of a plot by frame."""
-    return rows(path, f"/plots/{plot}", "Scalars:scalars")
+def figures(path: Path, *names: str) -> dict[int, list[float]]:
+    """Figures by frame."""
+    found = {}
+    for chunk in RrdReader(str(path)).stream().filter(content="/figures"):
+        batch = chunk.to_record_batch()
+        frames = batch.column("frame").cast("int64").to_numpy()
+        for frame, (row,) in zip(frames, batch.column("figures:values").to_pylist(), strict=True):
+            found[int(frame)] = [row[name] for name in names]
+    return found
 
 
 def verify(path: Path, footers: bool = True) -> bool:

@@ -28,10 +28,10 @@ from fake_simulation import FakeSimulation
 from recordings import (
     Viewer,
     environment,
+    figures,
     free_port,
     positions,
     rows,
-    scalars,
     static,
     verify,
 )
@@ -82,12 +82,9 @@ def test_the_recording_holds_what_the_simulation_showed(simulation: Any, tmp_pat
         np.testing.assert_array_equal(x, expected.astype(np.float32))
     colours = rows(file, "/world/blood", "Points3D:colors")[3]
     np.testing.assert_array_equal(colours, speed_colours(simulation.velocity, 1.0)[0])
-    steps = scalars(file, "wall")
-    assert {frame: list(values) for frame, values in steps.items()} == {
+    assert figures(file, "leaks", "wall_corrections") == {
         frame: [float(frame > 0), 4.0 * frame] for frame in range(6)
     }
-    times = rows(file, "/plots/speed", "Scalars:scalars")
-    assert sorted(times) == list(range(6))
 
 
 def test_the_recording_holds_the_vessel_and_the_scene(simulation: Any, tmp_path: Path) -> None:
@@ -109,7 +106,7 @@ def test_every_nth_frame_has_particles_and_every_frame_has_figures(
     file = tmp_path / "run.rrd"
     drive(simulation, [RerunView(simulation, file, every=3)], until=0.07, frame_interval=0.01)
     assert sorted(positions(file)) == [0, 3, 6]
-    assert sorted(scalars(file, "energy")) == list(range(8))
+    assert sorted(figures(file)) == list(range(8))
 
 
 def test_a_diverged_run_leaves_a_whole_recording_that_says_so(tmp_path: Path) -> None:
@@ -143,10 +140,10 @@ def test_kill_leaves_a_recording_to_about_the_last_five_seconds(tmp_path: Path) 
     with pytest.warns(match="footer|manifest"):
         found = positions(file)
     with pytest.warns(match="footer|manifest"):
-        figures = scalars(file, "energy")
+        plotted = figures(file)
     assert len(found) >= 21
     assert sorted(found) == list(range(len(found)))
-    assert abs(len(figures) - len(found)) <= 1
+    assert abs(len(plotted) - len(found)) <= 1
 
 
 def test_at_a_checkpoint_the_file_has_all_so_far(tmp_path: Path) -> None:
