@@ -34,29 +34,26 @@ TILT = math.radians(12.0)
 """The eye looks down a little, which tells near from far."""
 
 
-def colour_table(entries: int = 256) -> NDArray[np.uint32]:
-    """Colours of speed as 0xRRGGBBAA, from rest to full scale, shape (entries,)."""
+def colour_table(entries: int = 256) -> NDArray[np.uint8]:
+    """Colours of speed from rest to full scale: red, green, blue, shape (entries, 3)."""
     anchors = np.array(SPEED_COLOURS, float)
     at = np.linspace(0.0, 1.0, entries)
     even = np.linspace(0.0, 1.0, len(anchors))
-    red, green, blue = (
-        np.rint(np.interp(at, even, anchors[:, k])).astype(np.uint32) for k in range(3)
-    )
-    return (red << 24) | (green << 16) | (blue << 8) | np.uint32(0xFF)
+    bands = [np.rint(np.interp(at, even, anchors[:, k])) for k in range(3)]
+    return np.stack(bands, axis=1).astype(np.uint8)
 
 
-_TABLE = colour_table()
+COLOURS = colour_table()
+PACKED_COLOURS = np.array([int.from_bytes([*colour, 0xFF], "big") for colour in COLOURS], np.uint32)
+"""The same as 0xRRGGBBAA, (256,)."""
 
 
-def speed_colours(
-    velocities: NDArray[np.floating], full_scale: float
-) -> tuple[NDArray[np.uint32], NDArray[np.floating]]:
-    """Colours and speeds [m/s] of velocities (n, 3); `full_scale` [m/s] and above is brightest."""
+def speed_levels(velocities: NDArray[np.floating], full_scale: float) -> NDArray[np.uint8]:
+    """Where in the table the speeds of velocities (n, 3) are; `full_scale` [m/s] is its end."""
     speed = np.sqrt(np.einsum("ij,ij->i", velocities, velocities))
-    last = len(_TABLE) - 1
+    last = len(COLOURS) - 1
     # Not finite, it is shown as the fastest.
-    level = np.nan_to_num(speed * (last / full_scale), nan=last, posinf=last)
-    return _TABLE[np.clip(level, 0, last).astype(np.intp)], speed
+    return np.fmin(speed * (last / full_scale), last).astype(np.uint8)
 
 
 def upward(gravity: tuple[float, float, float]) -> Floats:

@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from app.appearance import (
     BACKGROUND,
+    COLOURS,
     FIELD_OF_VIEW,
     SPEED_COLOURS,
     TOOL_COLOUR,
     WALL_COLOUR,
     WOUND_COLOUR,
     eye,
-    speed_colours,
+    speed_levels,
     upward,
 )
 from app.channel import is_loopback, listen
@@ -422,8 +423,7 @@ class ControlPage:
         if picture is not self._shown:
             self._shown = picture
             self.pictures += 1
-            packed, _ = speed_colours(picture.velocities, self._full_scale)
-            colours = packed.astype(">u4").view(np.uint8).reshape(-1, 4)[:, :3]
+            colours = COLOURS[speed_levels(picture.velocities, self._full_scale)]
             with self._server.atomic():
                 self._blood.points, self._blood.colors = picture.positions, colours
                 if len(picture.drops) or len(self._drops.points):

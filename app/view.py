@@ -27,11 +27,12 @@ from rerun.blueprint.visualizers import Visualizer
 
 from app.appearance import (
     BACKGROUND,
+    PACKED_COLOURS,
     TOOL_COLOUR,
     WALL_COLOUR,
     WOUND_COLOUR,
     eye,
-    speed_colours,
+    speed_levels,
     upward,
     vertex_normals,
 )
@@ -500,7 +501,7 @@ class RerunView:
         items, self._notes = self._notes, []
         if frame % self.every == 0:
             position, velocity = simulation.positions_and_velocities()
-            colours, _ = speed_colours(velocity, self.full_scale)
+            colours = PACKED_COLOURS[speed_levels(velocity, self.full_scale)]
             points = rr.Points3D(position, colors=colours, radii=self._radius)
             items.append(("world/blood", points))
             items += self._surgery(simulation)

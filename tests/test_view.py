@@ -14,11 +14,12 @@ import pytest
 from app import view as view_module
 from app.appearance import (
     ASPECT,
+    COLOURS,
     FIELD_OF_VIEW,
+    PACKED_COLOURS,
     SPEED_COLOURS,
-    colour_table,
     eye,
-    speed_colours,
+    speed_levels,
     upward,
     vertex_normals,
 )
@@ -81,7 +82,7 @@ def test_the_recording_holds_what_the_simulation_showed(simulation: Any, tmp_pat
         expected = simulation.start + 0.01 * frame * simulation.velocity
         np.testing.assert_array_equal(x, expected.astype(np.float32))
     colours = rows(file, "/world/blood", "Points3D:colors")[3]
-    np.testing.assert_array_equal(colours, speed_colours(simulation.velocity, 1.0)[0])
+    np.testing.assert_array_equal(colours, PACKED_COLOURS[speed_levels(simulation.velocity, 1.0)])
     assert figures(file, "leaks", "wall_corrections") == {
         frame: [float(frame > 0), 4.0 * frame] for frame in range(6)
     }
@@ -268,12 +269,12 @@ def test_the_colours_of_speed_grow_evenly_lighter() -> None:
 
 
 def test_colours_run_from_rest_to_full_scale() -> None:
-    table = colour_table()
-    velocities = np.array([[0, 0, 0], [0, 0, 2.0], [3.0, 4.0, 0], [np.nan, 0, 0]])
-    colours, speed = speed_colours(velocities, full_scale=2.0)
-    assert list(colours) == [table[0], table[-1], table[-1], table[-1]]
-    assert list(speed[:3]) == [0.0, 2.0, 5.0]
-    assert table[0] == 0x6B0F1AFF
+    velocities = np.array(
+        [[0, 0, 0], [0, 1.0, 0], [0, 0, 2.0], [3, 4.0, 0], [np.nan, 0, 0], [0, np.inf, 0]]
+    )
+    assert speed_levels(velocities, full_scale=2.0).tolist() == [0, 127, 255, 255, 255, 255]
+    assert COLOURS.shape == (256, 3)
+    assert (PACKED_COLOURS[0], PACKED_COLOURS[-1]) == (0x6B0F1AFF, 0xFFF2C2FF)
 
 
 @pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 4.0, 1.0), (0, 0, 0)])
