@@ -10,7 +10,8 @@ import hmac
 import ipaddress
 import socket
 import threading
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import msgspec
 
@@ -33,6 +34,10 @@ _LINGER = 0.5
 _ALIVE = (30, 10, 3)
 """A client that is gone without a word is noticed by: asking after so long a silence [s], again
 each so long [s], so many times."""
+_TOO_MANY = f"{MOST_CLIENTS} clients are connected already; try again when one has left"
+_TOO_LONG = f"a line has more than {LONGEST_LINE} bytes; one command is one line"
+_NO_JSON = "the first line is no JSON object; this port speaks neither HTTP nor TLS"
+_NO_TOKEN = 'the token is wrong or absent; the first line must be {"token": "..."}'
 
 
 class _Query(msgspec.Struct, forbid_unknown_fields=True):
@@ -66,6 +71,130 @@ def is_loopback(listener: socket.socket) -> bool:
     return ipaddress.ip_address(listener.getsockname()[0]).is_loopback
 
 
+class _Client(asyncio.Protocol):
+    """One client, from its first byte to its last."""
+
+    def __init__(self, channel: "Channel"):
+        self._channel, self._loop = channel, asyncio.get_running_loop()
+        self._came = bytearray()
+        self._known = channel.token is None
+        self._spoke = self._ended = self._leaving = False
+        self._holds: set[str] = set()
+        """Why nothing of it is served for now."""
+        self._timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)
+        line = transport.get_extra_info("socket")
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in zip(("IDLE", "INTVL", "CNT"), _ALIVE, strict=True):
+            if hasattr(socket, f"TCP_KEEP{name}"):  # macOS has other names
+                line.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_KEEP{name}"), value)
+        clients = self._channel.clients
+        clients.add(self)
+        if len(clients) > MOST_CLIENTS:
+            self._send_away(_TOO_MANY)
+        elif not self._known:
+            self._wait(_PATIENCE, lambda: self._send_away(_NO_TOKEN))
+
+    def connection_lost(self, _: Exception | None) -> None:
+        self._channel.clients.discard(self)
+        self._wait(0.0, None)
+
+    def data_received(self, data: bytes) -> None:
+        # Of who is sent away it is thrown away: closed with bytes unread, its reply would be lost.
+        if not self._leaving:
+            self._came += data
+            self._serve()
+
+    def eof_received(self) -> bool:
+        self._ended = True
+        if self._leaving:
+            return False
+        self._serve()
+        return True
+
+    def pause_writing(self) -> None:
+        """Replies that nobody reads fill the buffers; this waits for that, not for ever."""
+        if not self._leaving:
+            self._hold("unread")
+            self._wait(_PATIENCE, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        if not self._leaving:
+            self._wait(0.0, None)
+            self._go_on("unread")
+
+    def _wait(self, patience: float, then: Callable[[], None] | None) -> None:
+        """Do something after so long [s], instead of what was to be done."""
+        if self._timer:
+            self._timer.cancel()
+        self._timer = self._loop.call_later(patience, then) if then else None
+
+    def _hold(self, why: str) -> None:
+        self._holds.add(why)
+        self.transport.pause_reading()
+
+    def _go_on(self, why: str) -> None:
+        self._holds.discard(why)
+        if not self._leaving:
+            self._serve()
+        if not self._holds:
+            self.transport.resume_reading()
+
+    def _serve(self) -> None:
+        """Answer the lines that have come, as far as is allowed."""
+        while not (self._holds or self._leaving or self.transport.is_closing()):
+            end = self._came.find(b"\n")
+            length = end if end >= 0 else len(self._came)
+            if length > LONGEST_LINE:
+                self._send_away(_TOO_LONG)
+            elif end >= 0 or (self._ended and length):
+                line = bytes(self._came[:length])
+                del self._came[: length + 1]
+                self._take(line)
+            elif self._ended:
+                self._leave(_PATIENCE)
+                self.transport.close()
+            else:
+                return
+
+    def _take(self, line: bytes) -> None:
+        if not self._spoke and line.lstrip()[:1] != b"{":
+            # A web page can make a browser send here: what is no JSON at once gets no say.
+            self._send_away(_NO_JSON)
+            return
+        self._spoke = True
+        if self._known:
+            self._reply(self._channel.answer(line))
+            if wait := self._channel.turn():
+                self._hold("rate")
+                self._loop.call_later(wait, self._go_on, "rate")
+        elif self._channel.knows(line):
+            self._known = True
+            self._wait(0.0, None)
+            self._reply({"ok": True})
+        else:
+            self._send_away(_NO_TOKEN)
+
+    def _reply(self, reply: dict[str, Any]) -> None:
+        # Numbers may be numpy's.
+        text = msgspec.json.encode(reply, enc_hook=lambda value: value.tolist())
+        self.transport.write(text + b"\n")
+
+    def _send_away(self, why: str) -> None:
+        self._reply({"error": why})
+        self._leave(_LINGER)
+        self._holds.clear()
+        self.transport.resume_reading()
+
+    def _leave(self, patience: float) -> None:
+        """Say no more, and be gone after so long [s]."""
+        self._leaving = True
+        self.transport.write_eof()
+        self._wait(patience, self.transport.abort)
+
+
 class Channel:
     """A server in its own thread; the simulation never waits for it."""
 
@@ -91,8 +220,8 @@ class Channel:
                 "have to know, or serve at 127.0.0.1"
             )
         self.host, self.port = listener.getsockname()[:2]
-        self._session, self._token = session, token
-        self._clients: set[asyncio.StreamWriter] = set()
+        self._session, self.token = session, token
+        self.clients: set[_Client] = set()
         self._due = 0.0
         self._ready = threading.Event()
         self._thread = threading.Thread(
@@ -109,82 +238,29 @@ class Channel:
 
     async def _serve(self, listener: socket.socket) -> None:
         self._loop, self._closing = asyncio.get_running_loop(), asyncio.Event()
-        server = await asyncio.start_server(self._meet, sock=listener, limit=LONGEST_LINE)
+        server = await self._loop.create_server(lambda: _Client(self), sock=listener)
         self._ready.set()
         await self._closing.wait()
         server.close()
-        # Cancelling them is not enough: before Python 3.12 wait_for may swallow it.
-        for writer in self._clients:
-            writer.transport.abort()
+        for client in list(self.clients):
+            client.transport.abort()
 
-    async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One client, from its first byte to its last."""
-        self._clients.add(writer)
-        try:
-            line = writer.get_extra_info("socket")
-            line.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            for name, value in zip(("IDLE", "INTVL", "CNT"), _ALIVE, strict=True):
-                if hasattr(socket, f"TCP_KEEP{name}"):  # macOS has other names
-                    line.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_KEEP{name}"), value)
-            refused = await self._talk(reader, writer)
-            if refused:
-                await self._reply(writer, {"error": refused})
-            writer.write_eof()
-            await asyncio.wait_for(self._drop(reader), _LINGER)
-        except (OSError, asyncio.TimeoutError, asyncio.CancelledError):
-            pass  # gone, as good as gone, or the channel closes
-        finally:
-            self._clients.remove(writer)
-            writer.transport.abort()
-
-    async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-        """Serve a client until it ends; or why it is sent away."""
-        if len(self._clients) > MOST_CLIENTS:
-            return f"{MOST_CLIENTS} clients are connected already; try again when one has left"
-        try:
-            line = await self._line(reader, _PATIENCE if self._token else None)
-            if line and line.lstrip()[:1] != b"{":
-                # A web page can make a browser send here: what is no JSON at once gets no say.
-                return "the first line is no JSON object; this port speaks neither HTTP nor TLS"
-            if self._token:
-                if not self._knows(line):
-                    return 'the token is wrong or absent; the first line must be {"token": "..."}'
-                await self._reply(writer, {"ok": True})
-                line = await self._line(reader)
-            while line:
-                await self._turn()
-                await self._reply(writer, self._answer(line))
-                line = await self._line(reader)
-        except asyncio.LimitOverrunError:
-            return f"a line has more than {LONGEST_LINE} bytes; one command is one line"
-        return ""
-
-    @staticmethod
-    async def _line(reader: asyncio.StreamReader, patience: float | None = None) -> bytes:
-        """The next line; at the end, or after so long [s], what there is of it."""
-        try:
-            return await asyncio.wait_for(reader.readuntil(), patience)
-        except asyncio.IncompleteReadError as end:
-            return end.partial
-        except asyncio.TimeoutError:
-            return b""
-
-    def _knows(self, first: bytes) -> bool:
+    def knows(self, first: bytes) -> bool:
         """Whether a first line shows the token."""
         try:
             given = msgspec.json.decode(first, type=_Token).token
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return False
-        return hmac.compare_digest(given.encode(), (self._token or "").encode())
+        return hmac.compare_digest(given.encode(), (self.token or "").encode())
 
-    async def _turn(self) -> None:
-        """Keep to the rate; meanwhile nothing more is read of this client."""
+    def turn(self) -> float:
+        """How long who has just been served waits for its next line, for the rate's sake [s]."""
         now = self._loop.time()
         self._due = max(self._due, now) + 1.0 / RATE
-        if self._due > now + _BURST:
-            await asyncio.sleep(self._due - now - 0.5 * _BURST)
+        ahead = self._due - now
+        return ahead - 0.5 * _BURST if ahead > _BURST else 0.0
 
-    def _answer(self, line: bytes) -> dict[str, Any]:
+    def answer(self, line: bytes) -> dict[str, Any]:
         """Do what a line says."""
         if b"query" in line:  # no command has such a word
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -195,18 +271,3 @@ class Channel:
         except InputError as error:
             return {"error": str(error)}
         return {"ok": True}
-
-    @staticmethod
-    async def _reply(writer: asyncio.StreamWriter, reply: dict[str, Any]) -> None:
-        # Numbers may be numpy's.
-        writer.write(msgspec.json.encode(reply, enc_hook=lambda value: value.tolist()) + b"\n")
-        if writer.is_closing() or writer.transport.get_write_buffer_size():
-            # Replies that nobody reads fill the buffers; then this waits, not for ever.
-            await asyncio.wait_for(writer.drain(), _PATIENCE)
-
-    @staticmethod
-    async def _drop(reader: asyncio.StreamReader) -> None:
-        """Throw away what still comes: closed with bytes unread, a connection loses its reply."""
-        for _ in range(64):
-            if not await reader.read(LONGEST_LINE):
-                return

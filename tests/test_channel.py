@@ -205,7 +205,7 @@ def test_who_never_reads_its_replies_is_closed(
     monkeypatch.setattr(session, "figures", lambda: figures)
     with Client(channel) as client:
         client.send(FIGURES * 50)
-        wait_until(lambda: not channel._clients)
+        wait_until(lambda: not channel.clients)
         assert works(channel)
 
 
@@ -216,7 +216,7 @@ def test_clients_that_vanish_leave_nothing_behind(channel: Channel, session: Any
         # As when a program is killed: the connection is reset.
         client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
         client.close()
-    wait_until(lambda: not channel._clients)
+    wait_until(lambda: not channel.clients)
     assert works(channel)
 
 
@@ -236,7 +236,7 @@ def test_one_client_too_many_is_told_and_closed(channel: Channel) -> None:
         assert f"{MOST_CLIENTS} clients" in late.reply()["error"]
         assert late.at_end()
     clients.pop().close()
-    wait_until(lambda: len(channel._clients) == MOST_CLIENTS - 1)
+    wait_until(lambda: len(channel.clients) == MOST_CLIENTS - 1)
     assert works(channel)
     for client in clients:
         client.close()
