@@ -153,7 +153,8 @@ def test_a_signal_ends_a_run_with_its_files_whole(
     scene: Path, tmp_path: Path, number: int, code: int
 ) -> None:
     rrd, summary = tmp_path / "run.rrd", tmp_path / "summary.json"
-    command = [sys.executable, "-m", "app", "run", scene, "--rrd", rrd, "--summary", summary]
+    command = [sys.executable, "-m", "app", "run", scene, "--until", 100.0]
+    command += ["--rrd", rrd, "--summary", summary]
     with subprocess.Popen(
         [str(part) for part in command],
         stdout=subprocess.PIPE,
