@@ -4,14 +4,20 @@ Behind a driven opening the vessel goes on as a short sleeve, full of blood that
 vessel as one plug, at a speed u:
 
     u     = Q / A                   where a flow Q is given
-    du/dt = mean_i(a_i) + p A / M   where a pressure p is given
+    du/dt = mean_i(a_i) + p A / M   where a pressure p_0 is given
 
-with A the plug's cross-section, M its mass and a_i what its neighbours in the vessel do to it,
-along the way in and without gravity: forces within the plug cancel.  Whatever blood is beyond the
-plane belongs to the plug, so that flow may turn.  The plug is made of columns of particles a
-spacing apart; a column that has moved on by a spacing gets another particle at its far end.  The
-columns are staggered, so that blood is added particle by particle: what was added differs from the
-integral of u A by two particles at most, and those that are due since the lists were built.
+with A the plug's cross-section, M its mass, a_i what its neighbours in the vessel do to it, along
+the way in and without gravity: forces within the plug cancel.  p is the reservoir's p_0 while blood
+leaves, and p_0 - rho u^2/2 while blood comes in: a reservoir at rest spends a part of its head on
+the speed of what it gives (Bernoulli), a jet into it gives none back.  With p_0 both ways two
+openings drive blood in a round, faster and faster, as backflow does where a traction is given
+(Bertoglio et al. 2018, doi:10.1002/cnm.2918).
+
+Whatever blood is beyond the plane belongs to the plug, so that flow may turn.  The plug is made of
+columns of particles a spacing apart; a column that has moved on by a spacing gets another particle
+at its far end.  The columns are staggered, so that blood is added particle by particle: what was
+added differs from the integral of u A by two particles at most, and those that are due since the
+lists were built.
 """
 
 import math
@@ -301,8 +307,8 @@ class Pistons:
                 orders[k] = 0.0, piston.flow * factor / area, 0.0, piston.speed
             elif piston.pressure is not None:
                 # p A/M, times the number of particles that M is of.
-                push = piston.pressure * factor * piston.bearing(self.spacing)
-                push /= self.density * self.spacing**3
+                head = piston.pressure * factor - 0.5 * self.density * max(0.0, piston.speed) ** 2
+                push = head * piston.bearing(self.spacing) / (self.density * self.spacing**3)
                 orders[k] = 1.0, push, float(-np.dot(gravity, piston.opening.normal)), piston.speed
         drive_plugs(particles, self, orders, dt)
         for piston, order in zip(self.each, orders, strict=False):
