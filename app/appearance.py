@@ -23,6 +23,7 @@ lightness rises evenly, so that equal differences of speed look equal."""
 
 WALL_COLOUR = (0xE0, 0x98, 0x90, 0x2A)
 TOOL_COLOUR = (0xC8, 0xD2, 0xDC, 0xFF)
+DROP_COLOUR = (0x96, 0x14, 0x14)
 WOUND_COLOUR = (0xFF, 0xE0, 0x60, 0xFF)
 """Red, green, blue, opacity."""
 BACKGROUND = (14, 16, 20)

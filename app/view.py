@@ -27,6 +27,7 @@ from rerun.blueprint.visualizers import Visualizer
 
 from app.appearance import (
     BACKGROUND,
+    DROP_COLOUR,
     PACKED_COLOURS,
     TOOL_COLOUR,
     WALL_COLOUR,
@@ -470,7 +471,19 @@ class RerunView:
                 ),
                 static=True,
             )
+        looks: Items = [
+            ("blood", rr.Points3D.from_fields(radii=self._radius)),
+            ("drops", rr.Points3D.from_fields(radii=self._radius, colors=[DROP_COLOUR])),
+            (
+                "wounds",
+                rr.LineStrips3D.from_fields(radii=0.3 * self._radius, colors=[WOUND_COLOUR]),
+            ),
+        ]
         shape = simulation.surgery.tool.shape
+        if shape is None:
+            looks.append(("tool", rr.Points3D.from_fields(colors=[TOOL_COLOUR])))
+        for entity, look in looks:
+            stream.log(f"world/{entity}", look, static=True)
         if shape is not None:
             stream.log(
                 "world/tool/shape",
@@ -502,8 +515,7 @@ class RerunView:
         if frame % self.every == 0:
             position, velocity = simulation.positions_and_velocities()
             colours = PACKED_COLOURS[speed_levels(velocity, self.full_scale)]
-            points = rr.Points3D(position, colors=colours, radii=self._radius)
-            items.append(("world/blood", points))
+            items.append(("world/blood", rr.Points3D(position, colors=colours)))
             items += self._surgery(simulation)
             if self._wall is not None:
                 narrow, way = self._wall
@@ -547,13 +559,8 @@ class RerunView:
         surgery = simulation.surgery
         items: Items = []
         if surgery.wounds:
-            drops = rr.Points3D(simulation.drops(), colors=[[150, 20, 20]], radii=self._radius)
-            items.append(("world/drops", drops))
-            rims = rr.LineStrips3D(
-                [w.rim() for w in surgery.wounds if w.is_open],
-                radii=0.3 * self._radius,
-                colors=[WOUND_COLOUR],
-            )
+            items.append(("world/drops", rr.Points3D(simulation.drops())))
+            rims = rr.LineStrips3D([w.rim() for w in surgery.wounds if w.is_open])
             items.append(("world/wounds", rims))
         tool = surgery.tool
         if tool.shape is not None:
@@ -562,7 +569,7 @@ class RerunView:
             )
             items.append(("world/tool", pose))
         elif surgery.suction_rate > 0.0:
-            tip = rr.Points3D([tool.position], radii=surgery.suction_radius, colors=[TOOL_COLOUR])
+            tip = rr.Points3D([tool.position], radii=surgery.suction_radius)
             items.append(("world/tool", tip))
         return items
 
