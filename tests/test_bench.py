@@ -1,5 +1,6 @@
 import json
 
+import msgspec
 import pytest
 
 from app import bench
@@ -28,7 +29,7 @@ def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for
 
 @needs_viser
 def test_what_control_costs_is_measured_with_a_hand_and_an_eye_on_the_run(tmp_path):
-    scene = read_scene(scene_path("tube"))
+    scene = msgspec.structs.replace(read_scene(scene_path("tube")), frame_interval=1e-3)
     found = in_own_process(measure_overhead, scene, weights_for(scene), "cpu", 1, tmp_path, 2)
     assert found.blood_particles == 3920
     assert found.latency_ms > 0.0
