@@ -123,7 +123,8 @@ class _Client(asyncio.Protocol):
     def resume_writing(self) -> None:
         if not self._leaving:
             self._wait(0.0, None)
-            self._go_on("unread")
+            # Not at once: the transport is still writing, and a close now would end it twice.
+            self._loop.call_soon(self._go_on, "unread")
 
     def _wait(self, patience: float, then: Callable[[], None] | None) -> None:
         """Do something after so long [s], instead of what was to be done."""
@@ -137,10 +138,13 @@ class _Client(asyncio.Protocol):
 
     def _go_on(self, why: str) -> None:
         self._holds.discard(why)
-        if not self._leaving:
+        try:
             self._serve()
-        if not self._holds:
-            self.transport.resume_reading()
+            if not self._holds:
+                self.transport.resume_reading()
+        except BaseException:
+            self.transport.abort()  # asyncio does so only for what it has read itself
+            raise
 
     def _serve(self) -> None:
         """Answer the lines that have come, as far as is allowed."""
@@ -184,15 +188,18 @@ class _Client(asyncio.Protocol):
 
     def _send_away(self, why: str) -> None:
         self._reply({"error": why})
-        self._leave(_LINGER)
+        self._leave(_PATIENCE if self.transport.get_write_buffer_size() else _LINGER)
         self._holds.clear()
         self.transport.resume_reading()
 
     def _leave(self, patience: float) -> None:
         """Say no more, and be gone after so long [s]."""
         self._leaving = True
-        self.transport.write_eof()
         self._wait(patience, self.transport.abort)
+        try:
+            self.transport.write_eof()
+        except OSError:  # it is gone already
+            self.transport.abort()
 
 
 class Channel:

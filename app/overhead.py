@@ -28,12 +28,12 @@ from taichi_sph.simulation import Simulation
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Event
 
-PAIRS = 24
+PAIRS = 16
 """Of stretches, one bare and one acted on; which is first changes from pair to pair."""
-FRAMES = 3
-"""Of a stretch: what threads still do of one falls into the next."""
-SETTLED = 3
-"""Frames before the first of them, that compile."""
+FRAMES = 6
+"""Of a stretch: what threads still do when it ends, a few milliseconds, is counted to neither."""
+SETTLED = 10
+"""Frames before the first of them: blood falls, and kernels are compiled."""
 _PATIENCE = 60.0
 """Longest wait for the client [s]."""
 COMMANDS = 50.0

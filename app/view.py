@@ -336,6 +336,7 @@ class RerunView:
         self.full_scale = simulation.derived.expected_speed or 1.0
         self._last: tuple[int, float] = (-1, 0.0)
         self._notes: Items = []
+        self._wounded = self._sucked = False
         self._wall: tuple[np.ndarray, np.ndarray] | None = None
         """Vertices of a wall that pulses, and how far each moves [m]."""
         blueprint = self._blueprint(simulation)
@@ -558,7 +559,9 @@ class RerunView:
         """Drops outside, open wounds and the tool."""
         surgery = simulation.surgery
         items: Items = []
-        if surgery.wounds:
+        # After a reset there are none any more, which must be said too.
+        self._wounded |= bool(surgery.wounds)
+        if self._wounded:
             items.append(("world/drops", rr.Points3D(simulation.drops())))
             rims = rr.LineStrips3D([w.rim() for w in surgery.wounds if w.is_open])
             items.append(("world/wounds", rims))
@@ -568,9 +571,13 @@ class RerunView:
                 translation=tool.position, quaternion=rr.Quaternion(xyzw=tool.rotation.as_quat())
             )
             items.append(("world/tool", pose))
-        elif surgery.suction_rate > 0.0:
-            tip = rr.Points3D([tool.position], radii=surgery.suction_radius)
-            items.append(("world/tool", tip))
+        else:
+            sucks = surgery.suction_rate > 0.0
+            self._sucked |= sucks
+            if self._sucked:
+                places = [tool.position] if sucks else []
+                tip = rr.Points3D(places, radii=surgery.suction_radius)
+                items.append(("world/tool", tip))
         return items
 
     def note(self, text: str) -> None:

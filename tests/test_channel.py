@@ -59,10 +59,11 @@ def session() -> Any:
 
 
 @pytest.fixture
-def channel(session: Any) -> Iterator[Channel]:
+def channel(session: Any, caplog: pytest.LogCaptureFixture) -> Iterator[Channel]:
     channel = Channel(session)
     yield channel
     channel.close()
+    assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == []
 
 
 @pytest.fixture
@@ -207,6 +208,33 @@ def test_who_never_reads_its_replies_is_closed(
         client.send(FIGURES * 50)
         wait_until(lambda: not channel.clients)
         assert works(channel)
+
+
+def test_who_reads_late_gets_all_replies(
+    channel: Channel, session: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = session.figures() | {"model": "x" * (1 << 20)}
+    monkeypatch.setattr(session, "figures", lambda: figures)
+    with Client(channel) as client:
+        client.send(FIGURES * 10, FIGURES.strip())
+        client.socket.shutdown(socket.SHUT_WR)
+        time.sleep(0.3)
+        assert works(channel)
+        assert [len(client.reply()["figures"]["model"]) for _ in range(11)] == 11 * [1 << 20]
+        assert client.at_end()
+    wait_until(lambda: not channel.clients)
+
+
+def test_clients_that_vanish_while_they_are_held_leave_nothing_behind(channel: Channel) -> None:
+    with Client(channel) as flood:
+        flood.send(PAUSE * 1000)
+        for _ in range(MOST_CLIENTS):
+            client = Client(channel)
+            client.send(PAUSE.strip())
+            client.close()
+        assert len(flood.file.readline()) > 0
+    wait_until(lambda: not channel.clients)
+    assert works(channel)
 
 
 def test_clients_that_vanish_leave_nothing_behind(channel: Channel, session: Any) -> None:

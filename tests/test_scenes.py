@@ -20,6 +20,7 @@ def test_every_shipped_scene_starts_and_keeps_its_blood(name):
         simulation.step(1.0)
     after = simulation.positions()
     figures = simulation.diagnostics()
+    assert PAPER.keys() <= shipped().keys()
     assert np.isfinite(after).all()
     assert figures.leaks == 0
     assert figures.wall_corrections == 0

@@ -24,7 +24,7 @@ from app.appearance import (
     vertex_normals,
 )
 from app.drive import drive
-from app.view import RerunView
+from app.view import PLOTS, RerunView
 from fake_simulation import FakeSimulation
 from recordings import (
     Viewer,
@@ -37,6 +37,7 @@ from recordings import (
     verify,
 )
 from taichi_sph.errors import InputError
+from taichi_sph.surgery import Wound
 
 FAKE = Path(__file__).with_name("fake_simulation.py")
 PATIENCE = 120.0
@@ -86,6 +87,34 @@ def test_the_recording_holds_what_the_simulation_showed(simulation: Any, tmp_pat
     assert figures(file, "leaks", "wall_corrections") == {
         frame: [float(frame > 0), 4.0 * frame] for frame in range(6)
     }
+    # All that is plotted is there, in its units: mJ, %, ms.
+    assert None not in figures(file, *(figure for _, lines in PLOTS for figure, *_ in lines))[5]
+    assert figures(file, "kinetic_energy", "compression_max", "step")[5] == pytest.approx(
+        [500.0, 2.0, 0.1]
+    )
+    radius = 0.5 * simulation.scene.discretization.spacing
+    assert static(file, "/world/blood", "Points3D:radii") == pytest.approx(radius)
+
+
+def test_wounds_and_the_tip_are_shown_until_they_are_gone(simulation: Any, tmp_path: Path) -> None:
+    file, surgery = tmp_path / "run.rrd", simulation.surgery
+    at, normal = np.array([0.0, 1e-3, 2e-3]), np.array([0.0, 0.0, 1.0])
+    simulation.drops = lambda: np.ones((3, 3), np.float32)
+    view = RerunView(simulation, file)
+    for frame in range(3):
+        surgery.wounds = [Wound(at, at, normal, 1e-3)] if frame == 1 else []
+        surgery.suction_rate, surgery.suction_radius = 1e-6 * (frame == 1), 2e-3
+        view.on_frame(simulation, frame, simulation.diagnostics())
+    view.close("finished")
+    rims = rows(file, "/world/wounds", "LineStrips3D:strips")
+    tips = rows(file, "/world/tool", "Points3D:positions")
+    assert sorted(rims) == sorted(tips) == [1, 2]
+    np.testing.assert_allclose(rims[1].reshape(-1, 3), Wound(at, at, normal, 1e-3).rim(), atol=1e-9)
+    assert tips[1].tolist() == [0.0, 0.0, 0.0]
+    assert (len(rims[2]), len(tips[2])) == (0, 0)
+    assert rows(file, "/world/tool", "Points3D:radii")[1] == pytest.approx(2e-3)
+    for entity, look in (("drops", "Points3D"), ("wounds", "LineStrips3D")):
+        assert len(static(file, f"/world/{entity}", f"{look}:colors")) == 1
 
 
 def test_the_recording_holds_the_vessel_and_the_scene(simulation: Any, tmp_path: Path) -> None:
