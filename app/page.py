@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _PERIOD = 0.05
 """Between two updates [s]."""
-_SHARE = 0.02
+_SHARE = 0.01
 """Of a processor's time, the page's own thread spends no more than this on frames."""
 _FIGURES_PERIOD = 0.2
 """Between two updates of the figures [s]: faster nobody reads."""
