@@ -332,6 +332,8 @@ class Browser:
         path = f'//label[.="{label}"]/following::input[@inputmode="decimal"][1]'
         keys = (Keys.CONTROL, "a", Keys.NULL, str(value), Keys.TAB)
         self.act(path, lambda found: found.send_keys(*keys))
+        # The page tells of changes each 50 ms, and of the last one only: no hand is as quick.
+        time.sleep(0.2)
 
     def choose(self, label: str, option: str) -> None:
         self.act(f'//label[.="{label}"]/following::input[1]', lambda found: found.click())
