@@ -35,16 +35,16 @@ TILT = math.radians(12.0)
 """The eye looks down a little, which tells near from far."""
 
 
-def colour_table(entries: int = 256) -> NDArray[np.uint8]:
-    """Colours of speed from rest to full scale: red, green, blue, shape (entries, 3)."""
+def _colour_table() -> NDArray[np.uint8]:
+    """Colours of speed from rest to full scale: red, green, blue, shape (256, 3)."""
     anchors = np.array(SPEED_COLOURS, float)
-    at = np.linspace(0.0, 1.0, entries)
+    at = np.linspace(0.0, 1.0, 256)
     even = np.linspace(0.0, 1.0, len(anchors))
     bands = [np.rint(np.interp(at, even, anchors[:, k])) for k in range(3)]
     return np.stack(bands, axis=1).astype(np.uint8)
 
 
-COLOURS = colour_table()
+COLOURS = _colour_table()
 PACKED_COLOURS = np.array([int.from_bytes([*colour, 0xFF], "big") for colour in COLOURS], np.uint32)
 """The same as 0xRRGGBBAA, (256,)."""
 

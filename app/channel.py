@@ -99,7 +99,7 @@ class _Client(asyncio.Protocol):
 
     def connection_lost(self, _: Exception | None) -> None:
         self._channel.clients.discard(self)
-        self._wait(0.0, None)
+        self._wait_no_more()
 
     def data_received(self, data: bytes) -> None:
         # Of who is sent away it is thrown away: closed with bytes unread, its reply would be lost.
@@ -122,15 +122,18 @@ class _Client(asyncio.Protocol):
 
     def resume_writing(self) -> None:
         if not self._leaving:
-            self._wait(0.0, None)
+            self._wait_no_more()
             # Not at once: the transport is still writing, and a close now would end it twice.
             self._loop.call_soon(self._go_on, "unread")
 
-    def _wait(self, patience: float, then: Callable[[], None] | None) -> None:
+    def _wait(self, patience: float, then: Callable[[], None]) -> None:
         """Do something after so long [s], instead of what was to be done."""
+        self._wait_no_more()
+        self._timer = self._loop.call_later(patience, then)
+
+    def _wait_no_more(self) -> None:
         if self._timer:
             self._timer.cancel()
-        self._timer = self._loop.call_later(patience, then) if then else None
 
     def _hold(self, why: str) -> None:
         self._holds.add(why)
@@ -176,7 +179,7 @@ class _Client(asyncio.Protocol):
                 self._loop.call_later(wait, self._go_on, "rate")
         elif self._channel.knows(line):
             self._known = True
-            self._wait(0.0, None)
+            self._wait_no_more()
             self._reply({"ok": True})
         else:
             self._send_away(_NO_TOKEN)
@@ -249,7 +252,7 @@ class Channel:
         self._ready.set()
         await self._closing.wait()
         server.close()
-        for client in list(self.clients):
+        for client in self.clients:
             client.transport.abort()
 
     def knows(self, first: bytes) -> bool:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 PAIRS = 16
 """Of stretches, one bare and one acted on; which is first changes from pair to pair."""
 FRAMES = 6
-"""Of a stretch: what threads still do when it ends, a few milliseconds, is counted to neither."""
+"""Of a stretch: what threads still do when it ends is counted to neither."""
 SETTLED = 10
 """Frames before the first of them: blood falls, and kernels are compiled."""
 _PATIENCE = 60.0

@@ -483,18 +483,15 @@ class RerunView:
         shape = simulation.surgery.tool.shape
         if shape is None:
             looks.append(("tool", rr.Points3D.from_fields(colors=[TOOL_COLOUR])))
+        else:
+            body = rr.Mesh3D(
+                vertex_positions=shape.vertices,
+                triangle_indices=shape.faces,
+                albedo_factor=TOOL_COLOUR,
+            )
+            looks.append(("tool/shape", body))
         for entity, look in looks:
             stream.log(f"world/{entity}", look, static=True)
-        if shape is not None:
-            stream.log(
-                "world/tool/shape",
-                rr.Mesh3D(
-                    vertex_positions=shape.vertices,
-                    triangle_indices=shape.faces,
-                    albedo_factor=TOOL_COLOUR,
-                ),
-                static=True,
-            )
         stream.log("scene", rr.TextDocument(self._document(simulation), media_type="text/markdown"))
 
     def _document(self, simulation: "Simulation") -> str:

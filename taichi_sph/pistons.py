@@ -263,11 +263,11 @@ class Pistons:
         self.speed = ti.field(float, count)
         """u of each plug [m/s]."""
         self.thrust = ti.field(ti.i64)
+        """Sum of the accelerations into the vessel over a plug [1/FINE m/s^2]."""
         # In a tree of its own: among 32-bit fields it overlaps them on Vulkan.
         alone = ti.FieldsBuilder()
         alone.dense(ti.i, count).place(self.thrust)
         alone.finalize()
-        """Sum of the accelerations into the vessel over a plug [1/FINE m/s^2]."""
         self.members = ti.field(int, count)
         """Particles of each plug."""
         self._orders = np.zeros((count, 4), number())

@@ -407,8 +407,8 @@ def test_blood_leaves_through_a_wound_is_counted_and_no_faster_than_a_free_jet(s
     # Torricelli, with the highest pressure there is and a hole half a spacing wider.
     head = PRESSURE / DENSITY + 9.81 * LENGTH
     area = math.pi * (wound.radius + 0.5 * D) ** 2
-    jet = area * math.sqrt(2.0 * head) * 0.05 / OF_ONE
-    assert 0.1 * jet < counts[-1] < JET * jet
+    jet = area * math.sqrt(2.0 * head) * 0.03 / OF_ONE
+    assert 0.1 * jet < counts[-1] - counts[0] < JET * jet
     # It drops from the hole's side, down.
     drops = sim.drops()
     assert len(drops) == counts[-1]
