@@ -19,7 +19,7 @@ run: $(INSTALLED)
 	$(BIN)/vesselflow run $(SCENE) --rrd recordings/$(notdir $(basename $(SCENE))).rrd $(OPTIONS)
 
 test: lint
-	$(BIN)/pytest --numprocesses 2 --dist loadfile
+	$(BIN)/pytest --numprocesses 2 --dist loadfile --durations=25
 
 lint: $(DEVELOPS)
 	$(BIN)/ruff check .

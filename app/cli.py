@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
+from app import version
 from app.models import MODELS
 from taichi_sph.errors import InputError, RunError
 
 if TYPE_CHECKING:
-    from app.drive import Summary
-    from app.session import Session
+    from app.control.session import Session
+    from app.run.loop import Summary
 
 EPILOG = "All quantities are in SI units. Exit codes: 0 done, 1 the run diverged, 2 wrong input."
 LIVE_PORT = 9876
@@ -75,17 +76,6 @@ seed_option = click.option("--seed", type=click.IntRange(min=0), default=0, show
 processes_option = click.option(
     "--processes", type=click.IntRange(min=1), default=1, show_default=True
 )
-
-
-def version() -> str:
-    """Version of the installed program."""
-    from importlib.metadata import PackageNotFoundError
-    from importlib.metadata import version as installed
-
-    try:
-        return installed("vesselflow")
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def print_version(context: click.Context, _: click.Parameter, asked: bool) -> None:
@@ -217,8 +207,8 @@ def run(
     host: str,
 ) -> int:
     """Simulate a scene."""
-    from app.output import check_output, write_json
-    from app.scenes import find_scene, weights_for, with_column
+    from app.files import check_output, write_json
+    from app.scenes.library import find_scene, weights_for, with_column
 
     if frames is not None and until is not None:
         raise InputError("--frames and --until: give one of the two")
@@ -253,15 +243,15 @@ def run(
 
     import hashlib
 
-    from app.checkpoint import Checkpoint, Checkpointer
-    from app.drive import Observer, drive
     from app.models import maker_of
     from app.progress import Progress
+    from app.run.checkpoint import Checkpoint, Checkpointer
+    from app.run.loop import Observer, drive
     from taichi_sph.runtime import start
     from taichi_sph.simulation import Simulation
 
     if model == "auto":
-        from app.advise import DEFAULT, advise
+        from app.studies.advise import DEFAULT, advise
 
         advice = advise(scene, error, DEFAULT, None, end, arch, threads)
         click.echo(advice.text, err=True)
@@ -286,7 +276,7 @@ def run(
     observers: list[Observer] = []
     acting = None
     if acted_on:
-        from app.session import open_session
+        from app.control.session import open_session
 
         acting = open_session(
             simulation, weights, script, session, begun, facts | {"checkpoint": checkpoint},
@@ -296,7 +286,7 @@ def run(
     elif begun is not None:
         simulation.go_on_from(begun.state)
     if rrd is not None or live is not None:
-        from app.view import RerunView
+        from app.view.rerun_view import RerunView
 
         shown = {key: facts[key] for key in ("arch", "precision", "seed", "version")}
         view = RerunView(simulation, rrd, live, every, shown, checkpoint)
@@ -334,8 +324,8 @@ def open_doors(session: "Session", port: int, host: str, doors: contextlib.ExitS
     """
     import importlib.util
 
-    from app.channel import Channel
-    from app.page import ControlPage
+    from app.control.channel import Channel
+    from app.control.page import ControlPage
 
     channel = Channel(session, host, port + 1, os.environ.get("VESSELFLOW_TOKEN"))
     doors.callback(channel.close)
@@ -358,8 +348,8 @@ def open_doors(session: "Session", port: int, host: str, doors: contextlib.ExitS
 @threads_option
 def replay(session: Path, rrd: Path | None, threads: int | None) -> int:
     """Run a session again from its log, and compare the blood bit by bit, frame by frame."""
-    from app.output import check_output
-    from app.session import run_again
+    from app.control.session import run_again
+    from app.files import check_output
 
     if rrd is not None:
         check_output(rrd, "--rrd", b"RRF2")
@@ -447,13 +437,13 @@ def train(
 
     A training that was cut short goes on where it was.
     """
-    from app import learn
+    from app.training import train as learn
 
     command = f"vesselflow train {data.name} --head {head} --correction {correction}"
     command += "".join(f" --hold-out {run}" for run in hold_out)
     command += f" --rounds {rounds} --iterations {iterations} --seed {seed}"
     learn.require_torch("train")
-    from nn.train import Settings
+    from nn.training.train import Settings
 
     settings = Settings(
         head=head, correction=correction, rounds=rounds, iterations=iterations, seed=seed
@@ -514,8 +504,8 @@ def record(
     seed: int,
 ) -> int:
     """Record the physics for training: a run for each column height, resumed if cut short."""
-    from app.record import record as record_runs
-    from app.scenes import scene_path
+    from app.scenes.library import scene_path
+    from app.training.record import record as record_runs
 
     recording = record_runs(
         scene_path(scene_name), heights, frames, out, substeps, features, processes,
@@ -528,8 +518,8 @@ def record(
 @cli.command()
 def scenes() -> None:
     """List the shipped scenes."""
-    from app.output import console
-    from app.scenes import scenes_table
+    from app.files import console
+    from app.scenes.library import scenes_table
 
     console().print(scenes_table())
 
@@ -538,8 +528,8 @@ def scenes() -> None:
 @click.argument("scene_name", metavar="SCENE")
 def info(scene_name: str) -> None:
     """Check a scene's vessel and print the numbers that follow from the scene."""
-    from app.output import console
-    from app.scenes import find_scene, info_tables
+    from app.files import console
+    from app.scenes.library import find_scene, info_tables
 
     out = console()
     for table in info_tables(find_scene(scene_name)):
@@ -565,7 +555,7 @@ def info(scene_name: str) -> None:
 )
 def new(surface: Path, out: Path | None, scale: float | None, spacing: float | None) -> None:
     """Make a scene folder of a vessel's surface (STL, PLY, OBJ), capped or open."""
-    from app.new import create_scene
+    from app.scenes.new_scene import create_scene
 
     click.echo(create_scene(surface, out, scale, spacing))
 
@@ -580,7 +570,7 @@ def validate(
     cases: tuple[str, ...], plot: Path | None, quick: bool, arch: str, threads: int | None
 ) -> int:
     """Compare the physics with theory and print a table (minutes)."""
-    from app import validate as validation
+    from app.validation import validate as validation
 
     return validation.main(list(cases) or None, plot, quick, arch, threads)
 
@@ -624,9 +614,9 @@ def bench(
     json_file: Path | None,
 ) -> int:
     """Measure the speed on scenes; without any, the paper's Table 1: A and B, 16 000 and 32 000."""
-    from app import bench as benchmark
-    from app.output import check_output
-    from app.scenes import scene_path
+    from app.bench import table1 as benchmark
+    from app.files import check_output
+    from app.scenes.library import scene_path
 
     if json_file is not None:
         check_output(json_file, "--json", b"{")
@@ -664,13 +654,13 @@ def ladder(
 
     Run 0 of each dataset chooses the weights, the last one measures them.
     """
-    from app import learn
-    from app.output import check_output
+    from app.files import check_output
+    from app.training import train as learn
 
     learn.require_torch("ladder")
     check_output(out, "--out", b"{")
     learn.check_plot(plot)
-    from app import ladder as study
+    from app.training import compare_networks as study
 
     study.main(list(data), out, seeds, iterations, ablate, processes, plot, arch)
     return 0
@@ -715,10 +705,10 @@ def compare(
     seed: int,
 ) -> int:
     """Pour a scene by physics and by networks side by side, and measure the difference."""
-    from app import compare as comparison
-    from app.learn import check_plot
-    from app.output import check_output
-    from app.scenes import find_scene, weights_for, with_column
+    from app.files import check_output
+    from app.scenes.library import find_scene, weights_for, with_column
+    from app.studies import compare as comparison
+    from app.training.train import check_plot
     from taichi_sph.runtime import start
 
     scene = with_column(find_scene(scene_name), particles, height)
@@ -769,10 +759,10 @@ def chart(
 
     What is in FILE already is not measured again: scenes can be added one by one.
     """
-    from app import chart as charting
-    from app.learn import check_plot
-    from app.output import check_output
-    from app.scenes import find_scene, varied
+    from app.files import check_output
+    from app.scenes.library import find_scene, varied
+    from app.studies import chart as charting
+    from app.training.train import check_plot
 
     check_output(out, "--out", b"scene,")
     check_plot(plot)
@@ -818,9 +808,9 @@ def stability(
 
     What is in FILE already is not measured again.
     """
-    from app import stability as study
-    from app.learn import check_plot
-    from app.output import check_output
+    from app.files import check_output
+    from app.studies import stability as study
+    from app.training.train import check_plot
 
     check_output(out, "--out", b"method,")
     check_plot(plot)
@@ -875,9 +865,9 @@ def advise(
     The scene is poured by the implicit model at several spacings; the rest is from the chart and
     the stability cases that come with the program.
     """
-    from app import advise as study
-    from app.output import check_output, console
-    from app.scenes import find_scene, varied
+    from app.files import check_output, console
+    from app.scenes.library import find_scene, varied
+    from app.studies import advise as study
 
     scene = varied(find_scene(scene_name), height, spacing)
     end = until or scene.duration
@@ -938,5 +928,5 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     message, code = invoke(arguments)
-    view = sys.modules.get("app.view")
+    view = sys.modules.get("app.view.rerun_view")
     leave(message, code, at_once=view is not None and view.viewer_stalled())

@@ -25,14 +25,14 @@ def maker_of(
         InputError: weights that cannot be read.
     """
     if name == "implicit":
-        from taichi_sph.implicit import implicit_for
+        from taichi_sph.fluid.implicit import implicit_for
 
         return implicit_for(scene)
     if name == "pcnet":
-        from app.scenes import weights_for
+        from app.scenes.library import weights_for
         from nn.pcnet import load_pcnet
 
         return load_pcnet(weights or weights_for(scene), scene, guarded)
-    from taichi_sph.acceleration import SphAcceleration
+    from taichi_sph.fluid.wcsph import SphAcceleration
 
     return SphAcceleration

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 
 from app.models import maker_of
-from app.scenes import find_scene
+from app.scenes.library import find_scene
 from taichi_sph import Simulation, start
 from taichi_sph.runtime import number
 

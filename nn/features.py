@@ -32,7 +32,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from taichi_sph.wall import wall_velocity
+from taichi_sph.particles.wall import wall_velocity
 
 COUNT = 23
 EXTENDED = 25

@@ -9,9 +9,9 @@ is pushed apart, the wall pushes in and viscosity dissipates whatever the weight
     mu_i        = min(eta exp(o_2), 0.03 rho_0 R^2/T)
     k_i = sigmoid(o_0),  g_i = 0.3 sigmoid(o_1)          (0.8 and 0.1 without rounds)
 
-It is the first guess of `taichi_sph.implicit`, whose rounds follow: as many as the weights were
-trained with.  Without any, a step is stable where k + 2 g stays under 4/3.8; the factors hold that,
-and what the rounds need, for any weights.  Weakly compressible SPH, linearised, is
+It is the first guess of `taichi_sph.fluid.implicit`, whose rounds follow: as many as the weights
+were trained with.  Without any, a step is stable where k + 2 g stays under 4/3.8; the factors hold
+that, and what the rounds need, for any weights.  Weakly compressible SPH, linearised, is
 k = (c T/R)^2 R^2 D, g = 0.  Viscosity is learned as a multiple of the blood's own at high shear,
 eta; its bound is what an explicit step T bears (Morris et al. 1997).  Monaghan's artificial term
 stays as the scene has it.
@@ -30,8 +30,7 @@ import taichi as ti
 
 from nn.features import FeatureScales, Inputs, features_of
 from nn.weights import CLIP, Weights, proportions, require_fit
-from taichi_sph.acceleration import Fluid, SphAcceleration
-from taichi_sph.implicit import (
+from taichi_sph.fluid.implicit import (
     DAMPING,
     LARGEST_ADVANCE,
     LARGEST_VISCOSITY,
@@ -40,11 +39,12 @@ from taichi_sph.implicit import (
     ImplicitAcceleration,
     step_within_reach,
 )
-from taichi_sph.neighbors import Neighbors
-from taichi_sph.particles import Particles
-from taichi_sph.rheology import Casson
+from taichi_sph.fluid.rheology import Casson
+from taichi_sph.fluid.wcsph import Fluid, SphAcceleration
+from taichi_sph.particles.neighbors import Neighbors
+from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.wall import Wall
 from taichi_sph.scene import Scene
-from taichi_sph.wall import Wall
 
 VARIABLE = Casson(eta=1.0, tau_y=0.0, n=1.0)
 """Tells the pairwise sum that viscosity differs from particle to particle; never evaluated."""

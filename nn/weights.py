@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from nn.features import NAMES, TABLE_VERSION, Inputs
-from taichi_sph.acceleration import Fluid
 from taichi_sph.errors import InputError
+from taichi_sph.fluid.wcsph import Fluid
 
 HEADS = ("direct", "pressure")
 SCHEMA = 3

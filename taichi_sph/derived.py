@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_sph.pulse import read_pulse
-from taichi_sph.rheology import rheology_of
+from taichi_sph.boundary.wall_motion import read_pulse
+from taichi_sph.fluid.rheology import rheology_of
+from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.scene import Scene
-from taichi_sph.vessel import Vessel
 from taichi_sph.waveform import read_waveform
 
 

@@ -2,8 +2,8 @@
 
 import taichi as ti
 
-from taichi_sph.pistons import Gates
-from taichi_sph.wall import wall_velocity
+from taichi_sph.boundary.inflow import Gates
+from taichi_sph.particles.wall import wall_velocity
 
 WALL_MARGIN = 0.1
 """Blood may come this close to the lumen surface [setbacks]; at rest it keeps some 0.5."""
@@ -67,7 +67,7 @@ def kick_drift(
     setbacks is put back on that distance along the normal of the proxies beside it, and its
     velocity into the wall is taken away.  The pressure of the wall holds blood that is packed;
     this holds a lone drop, which has no pressure.  Blood of a plug moves with it, and no wall stops
-    it (see `taichi_sph.pistons`).
+    it (see `taichi_sph.boundary.inflow`).
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.

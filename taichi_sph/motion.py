@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from taichi_sph.acceleration import AccelerationModel
+from taichi_sph.boundary.inflow import Pistons
 from taichi_sph.errors import RunError
+from taichi_sph.fluid.wcsph import AccelerationModel
 from taichi_sph.integrator import NO_PLUGS, NoPlugs, kick_drift, survey
-from taichi_sph.neighbors import Neighbors
-from taichi_sph.particles import Particles
-from taichi_sph.pistons import Pistons
-from taichi_sph.wall import Wall
+from taichi_sph.particles.neighbors import Neighbors
+from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.wall import Wall
 
 
 class Motion:

@@ -9,26 +9,26 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taichi_sph.acceleration import AccelerationModel, Fluid, SphAcceleration, force_on_tool
-from taichi_sph.calibration import calibrate
+from taichi_sph.boundary.inflow import LEAST_APART, Piston, Pistons, add_blood, plug_sites, sleeve
+from taichi_sph.boundary.outlets import LOST, SUCTION, Exits
+from taichi_sph.boundary.surgery import MOST_WOUNDS, Surgery, Wound
+from taichi_sph.boundary.tool import Tool, read_shape
+from taichi_sph.boundary.wall_motion import read_pulse
 from taichi_sph.derived import Derived, derive
 from taichi_sph.diagnostics import Diagnostics, diagnose
-from taichi_sph.equation_of_state import Tait
 from taichi_sph.errors import InputError, RunError
-from taichi_sph.exits import LOST, SUCTION, Exits
+from taichi_sph.fluid.calibration import calibrate
+from taichi_sph.fluid.equation_of_state import Tait
+from taichi_sph.fluid.rheology import rheology_of
+from taichi_sph.fluid.wcsph import AccelerationModel, Fluid, SphAcceleration, force_on_tool
+from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.motion import Motion
-from taichi_sph.neighbors import Neighbors, cells_within, make_grid
-from taichi_sph.particles import Particles
-from taichi_sph.pistons import LEAST_APART, Piston, Pistons, add_blood, plug_sites, sleeve
-from taichi_sph.pulse import read_pulse
-from taichi_sph.rheology import rheology_of
+from taichi_sph.particles.neighbors import Neighbors, cells_within, make_grid
+from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.smoothing_kernel import WendlandC2
+from taichi_sph.particles.wall import Wall
 from taichi_sph.runtime import number
 from taichi_sph.scene import Scene
-from taichi_sph.smoothing_kernels import WendlandC2
-from taichi_sph.surgery import MOST_WOUNDS, Surgery, Wound
-from taichi_sph.tool import Tool, read_shape
-from taichi_sph.vessel import Vessel, read_vessel
-from taichi_sph.wall import Wall
 from taichi_sph.waveform import read_waveform
 
 ModelMaker = Callable[[Fluid, int], AccelerationModel]
@@ -61,7 +61,7 @@ class Snapshot:
     controls: dict[str, Any]
     """What was done to the run: gravity, wounds, tool, pistons; numbers, lists and names only."""
     removed: np.ndarray
-    """Particles that have left by each place of the account, see `taichi_sph.exits`."""
+    """Particles that have left by each place of the account, see `taichi_sph.boundary.outlets`."""
     identity: np.ndarray
     """(n,)"""
     position: np.ndarray

@@ -2,6 +2,8 @@
 
 import os
 
+from places import VESSELS
+
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
@@ -39,7 +41,7 @@ def rtol(precision: str) -> float:
 @pytest.fixture(scope="session")
 def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a coarse box scene, blood that stands in it, and three recorded columns."""
-    shipped = Path(__file__).parent.parent / "assets" / "vessels" / "box"
+    shipped = VESSELS / "box"
     folder = tmp_path_factory.mktemp("box")
     (folder / "lumen.ply").write_bytes((shipped / "lumen.ply").read_bytes())
     text = (shipped / "scene.toml").read_text()

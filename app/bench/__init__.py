@@ -1,0 +1,1 @@
+"""Bench: what a step costs, pass by pass, and what live control costs."""

@@ -1,0 +1,1 @@
+"""Run: the loop over the frames of a simulation, and its checkpoints."""

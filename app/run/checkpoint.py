@@ -1,0 +1,113 @@
+"""Checkpoints: the whole state of a run in one file, so that a run killed at any moment can go on.
+
+The file is numpy's zip of arrays, written whole or not at all; zip keeps a checksum of each.
+"""
+
+import io
+import json
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from app.files import write_bytes
+from taichi_sph.errors import InputError
+from taichi_sph.simulation import Snapshot
+
+if TYPE_CHECKING:
+    from taichi_sph.diagnostics import Diagnostics
+    from taichi_sph.simulation import Simulation
+
+FORMAT = "vesselflow checkpoint 2"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where a run stands."""
+
+    facts: dict[str, Any]
+    """What the run is of; another run cannot go on from here."""
+    frame: int
+    state: Snapshot
+
+    def write(self, path: Path) -> None:
+        """Write the file, whole or not at all.
+
+        Raises:
+            OSError: the disk is full, or the folder is gone.
+        """
+        state = vars(self.state)
+        arrays: dict[str, Any] = {k: v for k, v in state.items() if isinstance(v, np.ndarray)}
+        numbers = {name: value for name, value in state.items() if name not in arrays}
+        head = {"format": FORMAT, "facts": self.facts, "frame": self.frame, "numbers": numbers}
+        content = io.BytesIO()
+        np.savez(content, head=np.array(json.dumps(head)), **arrays)
+        write_bytes(path, content.getvalue())
+
+    @classmethod
+    def read(cls, path: Path) -> "Checkpoint":
+        """Read a file.
+
+        Raises:
+            InputError: it cannot be read, is cut or damaged, or is no checkpoint.
+        """
+        try:
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+                head = json.loads(str(file["head"]))
+                if head["format"] != FORMAT:
+                    raise KeyError("format")
+                arrays = {name: file[name] for name in file.files if name != "head"}
+            state = Snapshot(**head["numbers"], **arrays)
+            return cls(head["facts"], head["frame"], state)
+        except FileNotFoundError:
+            raise InputError(f"--resume {path}: there is no such file") from None
+        except (
+            OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error,
+        ):  # fmt: skip
+            raise InputError(
+                f"--resume {path}: not a whole checkpoint; `vesselflow run --checkpoint` writes one"
+            ) from None
+
+    def require(self, facts: dict[str, Any], path: Path) -> None:
+        """Refuse to go on with another run.
+
+        Raises:
+            InputError: which fact differs.
+        """
+        for name, wanted in facts.items():
+            found = self.facts.get(name)
+            if found != wanted:
+                plain = name not in ("scene_text", "weights", "script")
+                values = f": {found} there, {wanted} here" if plain else ""
+                raise InputError(
+                    f"--resume {path}: is of another run, its {name.replace('_', ' ')} differs"
+                    f"{values}; give the command that wrote it"
+                )
+
+
+class Checkpointer:
+    """Writes a checkpoint every so many frames."""
+
+    def __init__(self, path: Path, every: int, facts: dict[str, Any]):
+        """`facts` say what the run is of."""
+        self.path, self.every, self.facts = path, every, facts
+
+    def on_frame(self, simulation: "Simulation", frame: int, figures: "Diagnostics") -> None:
+        """Write one if it is time.
+
+        Raises:
+            OSError: it cannot be written; the one before is still there.
+        """
+        if frame % self.every == 0:
+            try:
+                Checkpoint(self.facts, frame, simulation.snapshot()).write(self.path)
+            except OSError as error:
+                raise OSError(
+                    f"{self.path}: the checkpoint cannot be written: {error.strerror}"
+                ) from None
+
+    def close(self, ending: str) -> None:
+        """Nothing: the last checkpoint stays."""

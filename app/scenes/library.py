@@ -1,0 +1,179 @@
+"""Scenes: the shipped ones, the user's own, and what one amounts to."""
+
+import difflib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+from rich.table import Table
+
+from taichi_sph.errors import InputError
+from taichi_sph.scene import Scene, read_scene
+
+if TYPE_CHECKING:
+    from taichi_sph.derived import Derived
+    from taichi_sph.geometry.vessel import Finding, Vessel
+    from taichi_sph.geometry.wall_sampling import WallSample
+
+
+WEIGHTS = "pcnet.npz"
+"""File of the network's weights in the folder of a scene."""
+
+
+def vessels_folder() -> Path:
+    """Folder of the shipped vessels: inside the installed package, else in the source tree.
+
+    Raises:
+        InputError: the installation has none.
+    """
+    here = Path(__file__).resolve().parent
+    for folder in (here / "vessels", here.parents[1] / "assets" / "vessels"):
+        if folder.is_dir():
+            return folder
+    raise InputError(f"{here}: this installation has no vessels; install vesselflow again")
+
+
+def shipped() -> dict[str, Path]:
+    """Scene files that come with the program, by name, in alphabetical order."""
+    files = sorted(vessels_folder().glob("*/*.toml"))
+    return dict(sorted((f.parent.name if f.stem == "scene" else f.stem, f) for f in files))
+
+
+def scene_path(given: str) -> Path:
+    """The file of a scene given by the name of a shipped one, by its file or by its folder.
+
+    Raises:
+        InputError: there is no such scene.
+    """
+    known = shipped()
+    if given in known:
+        return known[given]
+    path = Path(given)
+    if path.is_dir():
+        path = path / "scene.toml"
+        if not path.is_file():
+            raise InputError(f"{given}: the folder has no scene.toml")
+    elif not path.exists():
+        close = difflib.get_close_matches(given, known, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"shipped are {', '.join(known)}"
+        raise InputError(f"{given}: neither a shipped scene nor a scene file or folder; {hint}")
+    elif path.suffix != ".toml":
+        raise InputError(
+            f"{given}: a scene is a .toml file; `vesselflow new {given}` makes one of a surface"
+        )
+    return path
+
+
+def find_scene(given: str) -> Scene:
+    """Read a scene, given as for `scene_path`.
+
+    Raises:
+        InputError: there is no such scene, or its file has a mistake.
+    """
+    return read_scene(scene_path(given))
+
+
+def with_column(scene: Scene, particles: int | None, height: float | None) -> Scene:
+    """The scene with another column, where one is asked for.
+
+    Raises:
+        InputError: both are asked for.
+    """
+    if particles is None and height is None:
+        return scene
+    if particles is not None and height is not None:
+        raise InputError("--particles and --height: give one of the two")
+    column = msgspec.structs.replace(scene.column, particles=particles, height=height, full=False)
+    return msgspec.structs.replace(scene, column=column)
+
+
+def varied(scene: Scene, height: float | None, spacing: float | None) -> Scene:
+    """The scene with another column [m] or spacing [m], where one is asked for, named by it."""
+    name = scene.name
+    if spacing is not None:
+        grid = msgspec.structs.replace(scene.discretization, spacing=spacing)
+        scene = msgspec.structs.replace(scene, discretization=grid)
+        name += f"-d{1e3 * spacing:g}mm"
+    if height is not None:
+        name += f"-{1e3 * height:g}mm"
+    return msgspec.structs.replace(with_column(scene, None, height), name=name)
+
+
+def weights_for(scene: Scene) -> Path:
+    """Weights to pour a scene with: those beside it, or the aorta's, which serve any vessel."""
+    own = Path(scene.folder) / WEIGHTS
+    return own if own.is_file() else shipped()["aortoiliac"].parent / WEIGHTS
+
+
+def scenes_table() -> Table:
+    """The shipped scenes, one a row."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("scene", no_wrap=True)
+    table.add_column("spacing", justify="right", no_wrap=True)
+    table.add_column("duration", justify="right", no_wrap=True)
+    table.add_column("title")
+    for name, path in shipped().items():
+        scene = read_scene(path)
+        spacing = f"{1e3 * scene.discretization.spacing:.3g} mm"
+        table.add_row(name, spacing, f"{scene.duration:g} s", scene.title)
+    return table
+
+
+def measure(scene: Scene) -> tuple["Vessel", "list[Finding]", "WallSample", "Derived"]:
+    """Read, check, sample and fill the vessel of a scene; the work behind `vesselflow info`.
+
+    Raises:
+        InputError: the surface cannot be used, or the column does not fit.
+    """
+    from taichi_sph.derived import derive
+    from taichi_sph.geometry.vessel import check_vessel, read_vessel
+
+    vessel = read_vessel(scene)
+    grid = scene.discretization
+    blood = vessel.fill_column(scene.column, grid.spacing)
+    wall = vessel.sample_wall(grid.wall_spacing_ratio * grid.spacing, 0.5 * grid.spacing)
+    derived = derive(scene, vessel, len(blood), len(wall.positions))
+    return vessel, check_vessel(vessel), wall, derived
+
+
+def _two_columns(title: str) -> Table:
+    table = Table(
+        title=title, title_justify="left", box=None, pad_edge=False, show_header=False, min_width=60
+    )
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    return table
+
+
+def info_tables(scene: Scene) -> list[Table]:
+    """What a scene amounts to: the vessel's check, then the numbers that follow from it.
+
+    Raises:
+        InputError: as `measure`.
+    """
+    vessel, findings, wall, derived = measure(scene)
+    checks = _two_columns(f"{scene.name}: {scene.title}\nsurface {vessel.label}")
+    for finding in findings:
+        checks.add_row("[green]ok[/]" if finding.good else "[yellow]note[/]", finding.text)
+
+    grid = scene.discretization
+    numbers = _two_columns("\nderived numbers")
+    for name, value in (
+        ("blood particles", f"{derived.blood_particles}"),
+        ("proxy particles", f"{derived.proxy_particles}"),
+        ("spacing", f"{1e3 * grid.spacing:.4g} mm"),
+        ("support radius", f"{1e3 * derived.support_radius:.4g} mm"),
+        ("across narrowest opening", f"{derived.particles_across_narrowest:.1f} particles"),
+        ("expected speed", f"{derived.expected_speed:.3g} m/s"),
+        ("sound speed", f"{derived.sound_speed:.3g} m/s"),
+        ("time step", f"{1e3 * derived.step:.3g} ms"),
+        ("steps, about", f"{scene.duration / derived.step:.0f} for {scene.duration:g} s"),
+        ("Reynolds number", f"{derived.reynolds_number:.3g}"),
+        (
+            "proxy spacing reached",
+            f"{wall.nearest_mean:.3f} of {1e3 * grid.wall_spacing_ratio * grid.spacing:.4g} mm, "
+            f"spread {wall.nearest_spread:.3f}, least {wall.nearest_least:.3f}",
+        ),
+    ):
+        numbers.add_row(name, value)
+    return [checks, numbers]

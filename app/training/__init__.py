@@ -1,0 +1,1 @@
+"""Training: data recorded from the physics, networks trained on it and compared."""

@@ -1,0 +1,1 @@
+"""Validation: what is computed against theory and measurement."""

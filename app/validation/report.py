@@ -1,0 +1,78 @@
+"""Rows and curves of `vesselflow validate`: what was computed beside what theory says."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    quantity: str
+    computed: str
+    theory: str
+    error: float
+    """Relative, unless the quantity says otherwise."""
+    tolerance: float
+    seconds: float
+    """Wall time since the row before."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within the tolerance; a NaN is not."""
+        return self.error <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A computed profile beside theory, for a picture."""
+
+    label: str
+    x: np.ndarray
+    computed: np.ndarray
+    theory_x: np.ndarray
+    theory: np.ndarray
+    source: str = "theory"
+    """What it is held against."""
+
+
+class Report:
+    """Where a case puts its rows and curves, and says how far it is."""
+
+    def __init__(self, advance: Callable[[float], None]):
+        """`advance` is told the fraction of the case that is done."""
+        self.advance = advance
+        self.rows: list[Row] = []
+        self.pictures: dict[str, tuple[str, str, list[Curve]]] = {}
+        self._since = time.perf_counter()
+
+    def add(
+        self, quantity: str, computed: str, theory: str, error: float, tolerance: float
+    ) -> None:
+        """Add a row; its wall time is the time since the last."""
+        now = time.perf_counter()
+        row = Row(quantity, computed, theory, float(error), tolerance, now - self._since)
+        self.rows.append(row)
+        self._since = now
+
+    def compare(
+        self, quantity: str, computed: float, theory: float, tolerance: float, unit: str = ""
+    ) -> None:
+        """Add a row of two numbers with their relative difference."""
+        self.add(
+            quantity, f"{computed:.5g} {unit}".strip(), f"{theory:.5g} {unit}".strip(),
+            abs(computed / theory - 1.0), tolerance,
+        )  # fmt: skip
+
+    def draw(self, picture: str, x_label: str, y_label: str, curve: Curve) -> None:
+        """Keep a curve for a picture of this name."""
+        self.pictures.setdefault(picture, (x_label, y_label, []))[2].append(curve)
+
+
+def relative_l2(computed: np.ndarray, theory: np.ndarray) -> float:
+    """sqrt(sum (a - b)^2 / sum b^2) over all particles; nothing averaged, nothing left out."""
+    return math.sqrt(np.square(computed - theory).sum() / np.square(theory).sum())

@@ -1,0 +1,1 @@
+"""View: recordings and live views in Rerun."""

@@ -1,0 +1,1 @@
+"""Training: networks made from recorded runs; the only place of torch."""

@@ -1,0 +1,1 @@
+"""Boundary: what moves the wall, brings blood in or takes it out."""

@@ -1,0 +1,386 @@
+"""Vessel: the lumen as a closed surface with openings, and what is asked of it.
+
+The surface is where blood ends.  A file may bring it closed, with flat caps, or open, as a tube;
+open ends are capped here.  Mistakes in the file are errors that say what to change.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_sph.errors import InputError
+from taichi_sph.geometry import clearance as passage
+from taichi_sph.geometry import filling, mesh, wall_sampling
+from taichi_sph.geometry.interior import Interior
+from taichi_sph.geometry.mesh import Booleans, Floats, Integers
+from taichi_sph.geometry.openings import (
+    Candidate,
+    Opening,
+    find_openings,
+    is_round,
+    load_surface,
+    require_manifold,
+    require_outward,
+    where,
+)
+from taichi_sph.geometry.wall_sampling import WallSample
+from taichi_sph.scene import Column, OpeningTable, Scene
+
+LARGEST = 2.0
+"""A larger surface was given in other units than it claims [m]."""
+SMALLEST = 1e-3
+"""And a smaller one [m]."""
+LEAST_ACROSS = 4.0
+"""Particles across the narrowest place below which nothing can be resolved."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the check of a surface."""
+
+    good: bool
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Vessel:
+    """A closed lumen surface with outward normals, in metres."""
+
+    vertices: Floats
+    """(n, 3) [m]."""
+    faces: NDArray[np.int32]
+    """Triangles, outward by the right-hand rule, (m, 3)."""
+    face_opening: NDArray[np.int32]
+    """Opening that a triangle caps, as an index into `openings`; -1 is wall.  (m,)."""
+    openings: tuple[Opening, ...]
+    """The openings that the scene names, in its order."""
+    unnamed: tuple[Opening, ...] = ()
+    """Openings of the surface that the scene does not name: capped."""
+    label: str = "surface"
+    """What messages call it: the file's path."""
+
+    @cached_property
+    def _triangles(self) -> Integers:
+        return np.ascontiguousarray(self.faces, np.int64)
+
+    @cached_property
+    def _winding(self) -> igl.FastWindingNumberBVH:
+        tree = igl.FastWindingNumberBVH()
+        tree.init(self.vertices, self._triangles)
+        return tree
+
+    @cached_property
+    def _nearest(self) -> mesh.Nearest:
+        return mesh.Nearest(self.vertices, self._triangles)
+
+    @cached_property
+    def _interior(self) -> Interior:
+        return Interior(*self.bounds, self.volume, self.signed_distance)
+
+    @cached_property
+    def wall_faces(self) -> Integers:
+        """Triangles that carry proxies (w, 3): all but the caps of open openings."""
+        is_open = np.array([opening.is_open for opening in self.openings] + [False])
+        return self._triangles[~is_open[self.face_opening]]
+
+    @cached_property
+    def volume(self) -> float:
+        """Volume of the lumen [m^3]."""
+        return mesh.enclosed_volume(self.vertices, self._triangles)
+
+    @cached_property
+    def wall_area(self) -> float:
+        """Area of the triangles that carry proxies [m^2]."""
+        return float(
+            np.linalg.norm(mesh.face_vectors(self.vertices, self.wall_faces), axis=1).sum()
+        )
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lowest and highest corner of the bounding box [m]."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
+    def opening(self, name: str) -> Opening:
+        """The opening of that name.
+
+        Raises:
+            InputError: there is none.
+        """
+        for opening in self.openings:
+            if opening.name == name:
+                return opening
+        allowed = ", ".join(opening.name for opening in self.openings) or "none"
+        raise InputError(f"column.opening: {name!r} is not an opening; allowed: {allowed}")
+
+    def contains(self, points: Floats) -> Booleans:
+        """Which points (k, 3) [m] lie within the lumen."""
+        if len(points) == 0:
+            return np.zeros(0, bool)
+        points = np.ascontiguousarray(points, np.float64)
+        return np.asarray(self._winding.winding_number(points)).reshape(-1) > 0.5
+
+    def distance(self, points: Floats) -> Floats:
+        """Distance of points (k, 3) to the closed surface [m], (k,)."""
+        return self._nearest(points)[0]
+
+    def nearest_wall(self, points: Floats) -> tuple[Floats, Integers, Floats, Floats]:
+        """Places on the surface nearest to points (k, 3) [m].
+
+        Returns:
+            distances [m] (k,), triangles (k,), places [m] (k, 3), unit normals outward (k, 3).
+        """
+        away, triangle, places = self._nearest(points)
+        normals = wall_sampling.normals_at(self.vertices, self._triangles, places, triangle)
+        return away, triangle, places, normals
+
+    def rim(self, number: int) -> Floats:
+        """Closed polygon round opening `number` [m], (n, 3)."""
+        loops = mesh.boundary_loops(self._triangles[self.face_opening == number])
+        longest = max(loops, key=len)
+        return self.vertices[longest]
+
+    def signed_distance(self, points: Floats) -> Floats:
+        """Distance of points (k, 3) to the closed surface [m], negative within the lumen, (k,)."""
+        return np.where(self.contains(points), -1.0, 1.0) * self.distance(points)
+
+    def count_leaks(self, points: Floats, tolerance: float = 0.0) -> int:
+        """Points (k, 3) that have left the lumen other than through an open opening.
+
+        Args:
+            points: Positions [m].
+            tolerance: A point this close to the surface counts as within [m].
+        """
+        points = np.asarray(points, np.float64)
+        points = points[~self._interior.holds(points)]
+        outside = points[~self.contains(points)]
+        for opening in self.openings:
+            if opening.is_open:
+                apart = outside - opening.centre
+                left = (apart @ opening.normal > -tolerance) & (
+                    np.linalg.norm(apart, axis=1) < 3.0 * opening.radius
+                )
+                outside = outside[~left]
+        if tolerance > 0.0:
+            outside = outside[self.distance(outside) > tolerance]
+        return len(outside)
+
+    def sample_wall(self, spacing: float, setback: float, seed: int = 0) -> WallSample:
+        """Spread proxies evenly over the wall and set them back out of the lumen.
+
+        The points are even on the lumen's surface and then moved along its outward normal; those
+        that this brings nearer to the lumen than 0.4 of the setback (in the crotch of a
+        bifurcation, or between branches that touch) are dropped.  At an open end none stands
+        beyond the opening's plane.
+
+        Args:
+            spacing: Distance between proxies [m]; wall area / spacing^2 of them are made.
+            setback: Distance from the lumen's surface [m].
+            seed: Of the random start; the same seed gives the same points to the last bit.
+        """
+        faces = self.wall_faces
+        ends = [value for o in self.openings if o.is_open for value in (*o.centre, *o.normal)]
+        key = wall_sampling.cache_key(self.vertices, faces, spacing, setback, seed, *ends)
+        stored = wall_sampling.load_cached(key)
+        if stored is not None:
+            return stored
+        points, nearest = wall_sampling.even_points(self.vertices, faces, spacing, seed)
+        figures = wall_sampling.evenness(points, self.vertices, faces, spacing)
+        normals = wall_sampling.normals_at(self.vertices, faces, points, nearest)
+        positions = points + setback * normals
+        for opening in self.openings:
+            if opening.is_open:
+                apart = positions - opening.centre
+                beyond = np.maximum(apart @ opening.normal, 0.0)
+                beyond[np.linalg.norm(points - opening.centre, axis=1) > 3.0 * opening.radius] = 0.0
+                positions -= beyond[:, None] * opening.normal
+        kept = (
+            self.signed_distance(positions) > 0.4 * setback
+            if setback > 0
+            else np.ones(len(points), bool)
+        )
+        sample = WallSample(positions[kept], normals[kept], *figures, int((~kept).sum()))
+        wall_sampling.store_cached(key, sample)
+        return sample
+
+    def fill_column(self, column: Column, spacing: float) -> Floats:
+        """Positions of the blood at the start [m], (n, 3): see `filling.fill_column`.
+
+        Raises:
+            InputError: the column does not fit, or its opening is not there.
+        """
+        return filling.fill_column(self, self.opening(column.opening), column, spacing)
+
+    @cached_property
+    def narrowest(self) -> float:
+        """Diameter of the largest ball that passes between the open openings [m].
+
+        Blind side branches do not count.  With no opening open: of the largest ball that fits.
+        """
+        ends = [(o.centre, o.normal, o.radius) for o in self.openings if o.is_open]
+        return 2.0 * passage.narrowest_radius(
+            self.vertices, self._triangles, self.wall_faces, ends, self.contains
+        )
+
+    def require_resolution(self, spacing: float) -> None:
+        """Refuse a spacing too coarse for the lumen.
+
+        Raises:
+            InputError: fewer than `LEAST_ACROSS` particles fit across the narrowest place.
+        """
+        across = self.narrowest / spacing
+        most = 0.998 * self.narrowest / LEAST_ACROSS
+        if across < LEAST_ACROSS:
+            raise InputError(
+                f"discretization.spacing: {spacing:g} m puts {across:.1f} particles across the "
+                f"narrowest place of {self.label} ({self.narrowest:.3g} m); at least "
+                f"{LEAST_ACROSS:g} are needed: at most {most:.3g} m"
+            )
+
+
+def build_vessel(
+    vertices: Floats, faces: Integers, openings: dict[str, OpeningTable], scale: float, label: str
+) -> Vessel:
+    """Make a vessel of a mesh in metres.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3), outward.
+        openings: The scene's; their centres are in units of the file.
+        scale: Metres per unit of the file.
+        label: What messages call the surface.
+
+    Raises:
+        InputError: the surface cannot hold blood, or an opening is not on it.
+    """
+    extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
+    if extent > LARGEST or extent < SMALLEST:
+        guess = scale * 1e-3 if extent > LARGEST else scale * 1e3
+        kind = (
+            "millimetres taken for metres" if extent > LARGEST else "metres taken for millimetres"
+        )
+        raise InputError(
+            f"{label}: {extent:.4g} m across at vessel.scale = {scale:g}, no vessel is; allowed: "
+            f"{SMALLEST:g} to {LARGEST:g} m; if these are {kind}, set vessel.scale = {guess:g}"
+        )
+    vertices, faces = mesh.clean(vertices, faces)
+    if len(faces) == 0:
+        raise InputError(f"{label}: all triangles have collapsed to lines; a tube is needed")
+    require_manifold(vertices, faces, label)
+    vertices, faces, found = find_openings(vertices, faces, label)
+    require_outward(vertices, faces, label)
+    matched = _match(openings, found, scale, label)
+    face_opening = np.full(len(faces), -1, np.int32)
+    named = []
+    for index, (name, candidate) in enumerate(matched.items()):
+        face_opening[candidate.faces] = index
+        named.append(_opening(name, candidate, openings[name].state == "open"))
+    others = [c for c in found if all(c is not chosen for chosen in matched.values())]
+    # Any flat wall looks like a cap; those listed as unnamed are rounder than a square.
+    round_ones = [c for c in others if c.from_hole or is_round(vertices, faces[c.faces], 0.82)]
+    unnamed = [_opening(f"unnamed_{k}", c, False) for k, c in enumerate(round_ones, 1)]
+    return Vessel(
+        vertices, faces.astype(np.int32), face_opening, tuple(named), tuple(unnamed), label
+    )
+
+
+def _opening(name: str, found: Candidate, is_open: bool) -> Opening:
+    return Opening(name, found.centre, found.normal, found.radius, found.area, is_open)
+
+
+def _match(
+    openings: dict[str, OpeningTable], found: list[Candidate], scale: float, label: str
+) -> dict[str, Candidate]:
+    """The flat end that each of the scene's openings means.
+
+    Raises:
+        InputError: none is near, or two names mean the same.
+    """
+    matched: dict[str, Candidate] = {}
+    for name, table in openings.items():
+        point = np.array(table.centre) * scale
+        near = [c for c in found if np.linalg.norm(c.centre - point) < c.radius]
+        if not near:
+            places = "; ".join(where(c.centre / scale) for c in found[:8]) or "none"
+            raise InputError(
+                f"openings.{name}: no opening of {label} is at {where(np.array(table.centre))}; "
+                f"found, in units of the file: {places}"
+            )
+        chosen = min(near, key=lambda c: float(np.linalg.norm(c.centre - point)))
+        for other, taken in matched.items():
+            if taken is chosen:
+                raise InputError(
+                    f"openings.{name}: the same opening of {label} as openings.{other}; "
+                    "each name needs its own"
+                )
+        matched[name] = chosen
+    return matched
+
+
+def read_vessel(scene: Scene) -> Vessel:
+    """Read, check and close the surface of a scene.
+
+    Raises:
+        InputError: the surface cannot hold blood, an opening is not on it, or the spacing is too
+            coarse for it.
+    """
+    path = Path(scene.folder) / scene.vessel.surface
+    vertices, faces = load_surface(path)
+    vessel = build_vessel(
+        vertices * scene.vessel.scale, faces, scene.openings, scene.vessel.scale, str(path)
+    )
+    vessel.opening(scene.column.opening)
+    vessel.require_resolution(scene.discretization.spacing)
+    return vessel
+
+
+def crossings(vessel: Vessel) -> Finding:
+    """Whether triangles cut through each other; at the rim of an opening that does no harm."""
+    faces = np.asarray(vessel.faces, np.int64)
+    crossed = mesh.self_intersections(vessel.vertices, faces)
+    rim = np.zeros(len(vessel.vertices), bool)
+    rim[faces[vessel.face_opening >= 0]] = True
+    inner = crossed[~rim[faces[crossed]].any(axis=1)]
+    if len(inner):
+        place = where(1e3 * vessel.vertices[faces[inner[0]]].mean(axis=0))
+        return Finding(
+            False, f"{len(inner)} triangles of the wall cut through others, first at {place} mm"
+        )
+    if len(crossed):
+        return Finding(
+            True, f"self-intersections only at openings' rims ({len(crossed)} triangles)"
+        )
+    return Finding(True, "no self-intersections")
+
+
+def check_vessel(vessel: Vessel) -> list[Finding]:
+    """What `vesselflow info` says about a surface."""
+    faces = np.asarray(vessel.faces, np.int64)
+    low, high = vessel.bounds
+    size = " x ".join(f"{1e3 * value:.1f}" for value in high - low)
+    closed = mesh.is_closed(faces)
+    handles = mesh.genus(vessel.vertices, faces)
+    findings = [
+        Finding(closed, "closed" if closed else "not closed"),
+        Finding(True, f"{len(faces)} triangles, {size} mm, lumen {vessel.volume * 1e6:.4g} ml"),
+        Finding(handles == 0, "no handles" if handles == 0 else f"{handles} handles (loops)"),
+        crossings(vessel),
+        Finding(True, f"narrowest place {1e3 * vessel.narrowest:.2f} mm"),
+    ]
+    for opening in vessel.openings:
+        state = "open" if opening.is_open else "capped"
+        findings.append(
+            Finding(True, f"opening {opening.name}: {state}, radius {1e3 * opening.radius:.2f} mm")
+        )
+    for opening in vessel.unnamed:
+        findings.append(
+            Finding(
+                False,
+                f"flat end at {where(1e3 * opening.centre)} mm, radius "
+                f"{1e3 * opening.radius:.2f} mm, not named by the scene: capped",
+            )
+        )
+    return findings

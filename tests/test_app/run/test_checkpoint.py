@@ -1,0 +1,146 @@
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.run.checkpoint import Checkpoint, Checkpointer
+from commands import HERE, vesselflow
+from taichi_sph.errors import InputError
+
+ARRAYS = ("identity", "position", "velocity", "acceleration", "density", "removed")
+
+
+def same(a: Path, b: Path) -> bool:
+    """Whether two checkpoints hold bitwise the same state at the same frame."""
+    one, other = Checkpoint.read(a), Checkpoint.read(b)
+    return (
+        one.frame == other.frame
+        and one.state.time == other.state.time
+        and one.state.steps == other.state.steps
+        and all(
+            getattr(one.state, name).tobytes() == getattr(other.state, name).tobytes()
+            for name in ARRAYS
+        )
+    )
+
+
+def arguments(box: Path, model: str, frames: int) -> list[str]:
+    return [
+        "run", str(box), "--model", model, "--frames", str(frames), "--checkpoint", "1",
+        "--height", "0.016",
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whole(box: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The last checkpoint of an uninterrupted run by each model."""
+    ends = {}
+    for model in ("physics", "implicit", "pcnet"):
+        folder = tmp_path_factory.mktemp(model)
+        vesselflow(folder, *arguments(box, model, 12))
+        ends[model] = folder / f"{box.name}.checkpoint.npz"
+    return ends
+
+
+@pytest.mark.parametrize("model", ["physics", "implicit", "pcnet"])
+def test_a_resumed_run_ends_bitwise_like_one_that_was_not_interrupted(
+    box: Path, whole: dict[str, Path], tmp_path: Path, model: str
+) -> None:
+    vesselflow(tmp_path, *arguments(box, model, 5))
+    half = tmp_path / f"{box.name}.checkpoint.npz"
+    assert Checkpoint.read(half).frame == 5
+    assert not same(half, whole[model])
+    vesselflow(tmp_path, *arguments(box, model, 12), "--resume", half)
+    assert same(half, whole[model])
+
+
+def test_a_run_killed_at_any_moment_goes_on(
+    box: Path, whole: dict[str, Path], tmp_path: Path
+) -> None:
+    kept = tmp_path / f"{box.name}.checkpoint.npz"
+    generator = random.Random(1)
+    command = [sys.executable, "-m", "app", *arguments(box, "physics", 12)]
+    kills = 0
+    for _ in range(10):
+        more = ["--resume", str(kept)] if kept.exists() else []
+        run = subprocess.Popen(
+            command + more, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env=HERE,
+        )  # fmt: skip
+        begun = kept.stat().st_mtime_ns if kept.exists() else 0
+        until = time.monotonic() + 60.0
+        while run.poll() is None and time.monotonic() < until:
+            if kept.exists() and kept.stat().st_mtime_ns > begun:
+                break  # it has written since: now any moment will do
+            time.sleep(0.002)
+        time.sleep(0.02 * generator.random())
+        if run.poll() is None:
+            run.send_signal(signal.SIGKILL)
+            kills += 1
+        run.wait()
+        Checkpoint.read(kept)
+    assert kills >= 3
+    vesselflow(tmp_path, *arguments(box, "physics", 12), "--resume", kept)
+    assert same(kept, whole["physics"])
+
+
+def test_a_cut_damaged_or_foreign_file_is_one_sentence(
+    whole: dict[str, Path], tmp_path: Path
+) -> None:
+    content = whole["physics"].read_bytes()
+    middle = bytearray(content)
+    middle[len(middle) // 2] ^= 0xFF
+    for name, some in {
+        "cut": content[: len(content) // 2], "damaged": bytes(middle), "empty": b"",
+        "text": b"no checkpoint",
+    }.items():  # fmt: skip
+        path = tmp_path / name
+        path.write_bytes(some)
+        with pytest.raises(InputError, match=rf"--resume .*{name}: not a whole checkpoint"):
+            Checkpoint.read(path)
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(InputError, match="not a whole checkpoint"):
+        Checkpoint.read(tmp_path / "other.npz")
+    with pytest.raises(InputError, match="there is no such file"):
+        Checkpoint.read(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        (["--height", "0.012"], "its height differs: 0.016 there, 0.012 here"),
+        (["--model", "implicit"], "its model differs: physics there, implicit here"),
+        (["--seed", "3"], "its seed differs: 0 there, 3 here"),
+    ],
+)
+def test_another_run_is_not_gone_on_with(
+    box: Path, whole: dict[str, Path], changed: list[str], expected: str
+) -> None:
+    command = ["run", str(box), "--height", "0.016", "--frames", "13", *changed]
+    assert expected in vesselflow(Path.cwd(), *command, "--resume", whole["physics"], code=2)
+
+
+def test_a_recording_of_the_run_so_far_is_not_replaced(
+    box: Path, whole: dict[str, Path], tmp_path: Path
+) -> None:
+    recording = tmp_path / "a.rrd"
+    recording.write_bytes(b"RRF2....")
+    command = [*arguments(box, "physics", 13), "--resume", whole["physics"], "--rrd", recording]
+    assert "holds the run so far" in vesselflow(tmp_path, *command, code=2)
+    assert recording.read_bytes() == b"RRF2...."
+
+
+def test_a_checkpoint_that_cannot_be_written_is_named(whole: dict[str, Path]) -> None:
+    kept = Checkpoint.read(whole["physics"])
+    simulation: Any = SimpleNamespace(snapshot=lambda: kept.state)
+    figures: Any = None
+    writer = Checkpointer(Path("/no/such/folder/a.npz"), 1, kept.facts)
+    with pytest.raises(OSError, match=r"^/no/such/folder/a.npz: the checkpoint cannot be written"):
+        writer.on_frame(simulation, 3, figures)

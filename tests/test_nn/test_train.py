@@ -1,0 +1,192 @@
+"""Training: torch's sums are the kernels', and a short training learns. Needs torch, an extra."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is an extra: pip install 'vesselflow[train]'")
+
+from app.scenes.library import find_scene  # noqa: E402
+from app.training.compare_networks import persistence, ridge  # noqa: E402
+from builders import vesselflow  # noqa: E402
+from nn.dataset import Dataset  # noqa: E402
+from nn.features import COUNT, FeatureScales  # noqa: E402
+from nn.pcnet import DirectPcNet, make_pcnet  # noqa: E402
+from nn.training.rollout import Stage  # noqa: E402
+from nn.training.train import (  # noqa: E402
+    INPUTS,
+    Course,
+    Model,
+    Progress,
+    Sample,
+    Settings,
+    train_weights,
+)
+from nn.weights import Training, Weights  # noqa: E402
+from taichi_sph.errors import InputError  # noqa: E402
+from taichi_sph.geometry.vessel import read_vessel  # noqa: E402
+
+CLOSE = {"f64": 2e-6, "f32": 2e-5}
+"""Of the largest acceleration; torch sums in f32."""
+
+
+@pytest.fixture(scope="module")
+def stage() -> Stage:
+    """A small column in the straight tube, a while after it has let go."""
+    scene = find_scene("tube")
+    grid = msgspec.structs.replace(scene.discretization, spacing=1.25e-3)
+    column = msgspec.structs.replace(scene.column, height=0.015, particles=None)
+    scene = msgspec.structs.replace(scene, discretization=grid, column=column)
+    stage = Stage(scene, read_vessel(scene), 0)
+    stage.advance_to(0.01)
+    # Stirred, so that every term of the sums matters.
+    state = stage.state()
+    noise = np.random.default_rng(0).normal(size=state.velocity.shape)
+    stage.restore(
+        type(state)(
+            state.position,
+            (state.velocity + 0.05 * noise).astype(state.velocity.dtype),
+            state.alive,
+        ),
+        stage.time,
+        stage.steps,
+    )
+    return stage
+
+
+@pytest.fixture(scope="module")
+def course(box: Path) -> Iterator[Course]:
+    """One for all trainings: each new one compiles everything again."""
+    with Dataset(box / "data.h5") as file:
+        yield Course(file, [0])
+
+
+@pytest.mark.parametrize(("head", "rounds"), [("direct", 0), ("pressure", 0), ("pressure", 2)])
+def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precision):
+    d, radius = stage.scene.discretization.spacing, stage.fluid.kernel.support_radius
+    sound = stage.derived.sound_speed
+    scales = FeatureScales(radius, d, 2e-4, sound)
+    training = Training(
+        head, INPUTS[head], d, radius, 2e-4, 4, rounds, sound, 1.0, 0.05, 17.3, "bp", 0, "tube", ""
+    )
+    torch.manual_seed(1)
+    features = stage.features(scales)[:, training.columns.index]
+    model = Model(training, features.mean(axis=0), np.maximum(features.std(axis=0), 1e-2), 0.7)
+    n = stage.particles.count[None]
+    sample = Sample(stage, scales, np.zeros((n, 3)), np.ones(n, bool), pairs=head == "pressure")
+    with torch.no_grad():
+        fluid = stage.fluid
+        down = torch.tensor((0.0, 0.0 if head == "direct" else -9.81, 0.0))
+        density, eta = fluid.state.rest_density, fluid.rheology.eta
+        expected = model.step(sample, density, eta, down).acceleration.numpy()
+    net = make_pcnet(model.weights(), stage.fluid, scales, stage.particles.capacity)
+    if isinstance(net, DirectPcNet):
+        net.guarded = False
+    net.accelerate(stage.particles, stage.wall, stage.neighbors, (0.0, -9.81, 0.0))
+    found = stage.particles.acceleration.to_numpy()[:n]
+    scale = np.abs(expected).max()
+    assert scale > 0.0
+    assert np.abs(found - expected).max() < CLOSE[precision] * scale
+
+
+def one_step_error(course: Course, weights: Weights) -> float:
+    """Root mean square error of the acceleration over the held-out run [m/s^2]."""
+    run, net, wrong = course.held[0], course.pcnet(weights), []
+    particles = course.stage.particles
+    for frame in range(20, len(run), 8):
+        course.put(run, frame)
+        course.stage.model = net
+        net.accelerate(particles, course.stage.wall, course.stage.neighbors, course.scene.gravity)
+        n = particles.count[None]
+        identity = particles.identity.to_numpy()[:n]
+        valid = run.has_target(frame)[identity]
+        found = particles.acceleration.to_numpy()[:n]
+        wrong.append(((found - run.target(frame)[identity])[valid] ** 2).sum(axis=1))
+    return float(np.sqrt(np.concatenate(wrong).mean()))
+
+
+def test_training_learns_and_its_weights_run(box: Path, course: Course, tmp_path: Path):
+    data, out, picture = box / "data.h5", tmp_path / "w.npz", tmp_path / "w.png"
+    vesselflow("train", data, "--out", out, "--iterations", "60", "--plot", picture)
+    told = msgspec.json.decode(out.with_suffix(".history.json").read_bytes())
+    assert told["validations"][-1]["iteration"] == 60
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert not list(tmp_path.glob("*.checkpoint*"))
+    learned = one_step_error(course, Weights.load(out))
+    # What needs no training: a straight line through the 23 features, and nothing at all.
+    straight = one_step_error(course, ridge(course, Settings(head="direct")))
+    nothing = one_step_error(course, persistence(course, Settings(head="direct")))
+    assert learned < 0.7 * min(straight, nothing)
+    figures = course.rollout(course.pcnet(Weights.load(out)), course.held[0])
+    assert figures["survived"] == 1.0
+    # Blood that stands has compression from its own weight, g h/c^2 = 0.1 %, and from the layers'
+    # settling; it must not collapse.
+    assert figures["compression_p99"] < 0.1
+    output = vesselflow("run", box, "--until", "0.002", "--model", "pcnet", "--weights", out)
+    assert "leaks 0" in output
+
+
+class KilledError(Exception):
+    """Stands for whatever ends a training early."""
+
+
+def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, tmp_path):
+    settings = Settings(iterations=20, validate_every=5)
+    whole, cut = tmp_path / "whole.npz", tmp_path / "cut.npz"
+
+    def quiet(_: Progress) -> None:
+        pass
+
+    def kill(at: Progress) -> None:
+        if at.iteration == 10:
+            raise KilledError
+
+    train_weights(course, whole, settings, report=quiet)
+    with pytest.raises(KilledError):
+        train_weights(course, cut, settings, report=kill)
+    checkpoint = tmp_path / "cut.npz.checkpoint"
+    other = Settings(iterations=20, validate_every=5, seed=1)
+    with pytest.raises(InputError, match=r"cut.npz.checkpoint: holds a training with seed 0"):
+        train_weights(course, cut, other, report=quiet)
+    weights, history = train_weights(course, cut, settings, report=quiet)
+    assert not checkpoint.exists()
+    assert [row["iteration"] for row in history] == [5, 10, 15, 20]
+    expected = Weights.load(whole)
+    for (w, b), (w_0, b_0) in zip(weights.layers, expected.layers, strict=True):
+        np.testing.assert_array_equal(w, w_0)
+        np.testing.assert_array_equal(b, b_0)
+    checkpoint.write_bytes(b"PK")
+    with pytest.raises(InputError, match="not a checkpoint, or a cut one"):
+        train_weights(course, cut, settings, report=quiet)
+
+
+def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
+    """The physics takes four steps a frame; rolled out from the first frame it is the recording."""
+    figures = course.rollout(course.stage.physics, course.held[0])
+    assert figures["survived"] == 1.0
+    # Of a way of some tenths of a spacing; behind in time by half it would be 0.75 off.
+    assert figures["path_error"] < 0.1
+
+
+def test_ridge_finds_a_straight_line(course, monkeypatch):
+    """Targets that are linear in the features, with an offset, are met nearly exactly."""
+    features, _ = course.examples(32)
+    spread = features[:, :COUNT].std(axis=0, keepdims=True).T.clip(1e-3)
+    line = np.random.default_rng(0).normal(size=(COUNT, 3)) / spread
+    target = (features[:, :COUNT] @ line + 3.0) * course.scales.acceleration
+    monkeypatch.setattr(course, "examples", lambda _: (features, target))
+    weights = ridge(course, Settings(head="direct"))
+    found = weights.evaluate(features[:, :COUNT]) * course.scales.acceleration
+    # The penalty is a thousandth of a feature's variance.
+    assert np.abs(found - target).max() < 0.02 * np.abs(target - target.mean(axis=0)).max()
+
+
+def test_persistence_gives_back_the_previous_acceleration(course):
+    weights = persistence(course, Settings(head="direct"))
+    features, _ = course.examples(1)
+    np.testing.assert_allclose(
+        weights.evaluate(features[:, :COUNT]), features[:, :3], rtol=1e-4, atol=1e-9
+    )

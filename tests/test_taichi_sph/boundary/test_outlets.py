@@ -1,0 +1,210 @@
+"""Exits against brute force: what has left by which, the account, suction, and drops that fall."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from builders import CAPACITY, D, Stage, number, precision, sphere
+from taichi_sph.boundary.outlets import LOST, MOST_DROPS, SUCTION, Exits, suck
+
+ROUNDING = {"f64": 1e-12, "f32": 1e-6}
+"""Positions and sums of two or three terms, over the box or the largest term."""
+DOUBT = {"f64": 1e-12, "f32": 1e-5}
+"""Points this near to a surface, over a spacing, may be told either way."""
+GRAVITY = np.array([0.3, -0.2, -9.81])
+
+# Of the round vessel's four exits: ends of the line [D], normal, reach [D].
+ROUND = ((4.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 0.0, 0.0), 6.0)
+CUT = ((-3.0, 6.0, -2.0), (2.0, 6.0, 2.5), (0.0, 0.8, 0.6), 5.0)
+BESIDE = ((5.0, 1.0, 0.0), (5.0, 1.0, 0.0), (0.6, 0.8, 0.0), 7.0)
+
+
+@cache
+def exits() -> Exits:
+    return Exits(4)
+
+
+def clear() -> Exits:
+    """The exits as they were made: all shut, nothing has left."""
+    e = exits()
+    e.reach.fill(0.0)
+    e.removed.fill(0)
+    e.drop_count[None] = 0
+    return e
+
+
+def opened(k: int, exit_: tuple, drips: bool = False) -> None:
+    begin, end, normal, reach = exit_
+    exits().open(k, D * np.array(begin), D * np.array(end), np.array(normal), D * reach, drips)
+
+
+def cloud(seed: int, count: int = CAPACITY) -> tuple[np.ndarray, np.ndarray]:
+    """Points all over the round vessel's box and a little beyond it, and velocities."""
+    generator = np.random.default_rng(seed)
+    x = generator.uniform(-10.5 * D, 11.0 * D, (count, 3)).astype(number()).astype(float)
+    return x, generator.normal(size=x.shape).astype(number()).astype(float)
+
+
+def corners(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    grid = stage.neighbors.grid
+    lower = np.array(grid.lower)
+    return lower, lower + np.array(grid.cell) * np.array(grid.shape)
+
+
+def beyond(x: np.ndarray, exit_: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Which points have left by an exit, and how near each is to being told otherwise [D]."""
+    begin, end, normal = (np.array(v) for v in exit_[:3])
+    # Nearest of many points on the line, then of many about that: no formula of the foot.
+    r, place = x / D - begin, np.zeros(len(x))
+    for half in (0.5, 1e-2, 2e-4, 4e-6, 1e-7):
+        tried = np.clip(place[:, None] + half * np.linspace(-1.0, 1.0, 201) + 0.5 * (half == 0.5),
+                        0.0, 1.0)  # fmt: skip
+        away = np.linalg.norm(r[:, None] - tried[..., None] * (end - begin), axis=2)
+        best = away.argmin(axis=1)
+        place = tried[np.arange(len(x)), best]
+    distance, height = away.min(axis=1), r @ normal
+    left = (height > 0.0) & (distance < exit_[3])
+    return left, np.minimum(np.abs(height), np.abs(distance - exit_[3]))
+
+
+def names(stage: Stage) -> np.ndarray:
+    return stage.particles.identity.to_numpy()[: stage.particles.count[None]]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_has_left_and_by_which_exit_is_what_brute_force_says(seed):
+    stage, e = sphere(), clear()
+    # Exit 1 is shut; 3 overlaps 0, which is asked first.
+    opened(0, ROUND)
+    opened(2, CUT)
+    opened(3, BESIDE)
+    x, v = cloud(seed)
+    stage.put(x, v)
+    e.mark(stage.particles, stage.neighbors.grid, 0.0)
+    lower, upper = corners(stage)
+    outside = ((x < lower) | (x > upper)).any(axis=1)
+    doubt = np.abs(np.stack([x - lower, x - upper])).min(axis=(0, 2)) / D
+    expected = np.where(outside, -2 - LOST, np.arange(len(x)))
+    for k, each in ((3, BESIDE), (2, CUT), (0, ROUND)):
+        left, near = beyond(x, each)
+        expected[left] = -4 - k
+        doubt = np.minimum(doubt, near)
+    certain = doubt > DOUBT[precision()]
+    assert certain.mean() > 0.99
+    found = names(stage)
+    np.testing.assert_array_equal(found[certain], expected[certain])
+    # Every kind is there, and what two exits claim too.
+    assert {-2, -4, -6, -7} <= set(found.tolist())
+    assert (beyond(x, ROUND)[0] & beyond(x, BESIDE)[0]).any()
+    assert (beyond(x, CUT)[0] & outside).any()
+    places = {LOST: -2, SUCTION: -3} | {2 + k: -4 - k for k in range(4)}
+    counted = [int((found == name).sum()) for _, name in sorted(places.items())]
+    np.testing.assert_array_equal(e.account(), counted)
+    assert e.account()[[SUCTION, 3]].tolist() == [0, 0]
+
+
+def test_marking_again_counts_nobody_twice():
+    stage, e = sphere(), clear()
+    opened(0, ROUND)
+    stage.put(*cloud(3))
+    e.mark(stage.particles, stage.neighbors.grid, 0.0)
+    first, marked = e.account(), names(stage)
+    e.mark(stage.particles, stage.neighbors.grid, 0.0)
+    np.testing.assert_array_equal(e.account(), first)
+    np.testing.assert_array_equal(names(stage), marked)
+    assert first.sum() == (marked < 0).sum() > 0
+
+
+def test_a_shut_exit_lets_nothing_out():
+    stage, e = sphere(), clear()
+    opened(0, ROUND)
+    opened(1, CUT)
+    e.shut(0)
+    e.shut(1)
+    x, _ = cloud(4)
+    stage.put(0.8 * x)
+    e.mark(stage.particles, stage.neighbors.grid, 0.0)
+    assert e.account().tolist() == [0] * 6
+    np.testing.assert_array_equal(names(stage), np.arange(len(x)))
+
+
+@pytest.mark.parametrize("most", [0, 1, 7, 10_000])
+def test_suction_takes_the_first_so_many_that_are_near(most):
+    stage, e = sphere(), clear()
+    x, v = cloud(5)
+    gone = np.arange(0, len(x), 5)
+    identity = np.arange(len(x))
+    identity[gone] = -4
+    tip, reach = np.array([1.0, -2.0, 0.5]) * D, 4.0 * D
+    away = np.linalg.norm(x - tip, axis=1)
+    assert np.abs(away - reach).min() > DOUBT[precision()] * D
+    near = np.flatnonzero((away < reach) & (identity >= 0))
+    assert len(near) > 10
+    results = []
+    for _ in range(3):
+        clear()
+        stage.put(x, v, identity)
+        taken = suck(stage.particles, e, *tip, reach, most)
+        results.append(names(stage))
+        assert taken == min(most, len(near))
+        assert e.account().tolist() == [0, taken, 0, 0, 0, 0]
+    expected = identity.copy()
+    expected[near[:most]] = -2 - SUCTION
+    for found in results:
+        np.testing.assert_array_equal(found, expected)
+
+
+def dripped(seed: int, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mark a cloud at a time; positions and velocities of what has left through exit 2."""
+    stage = sphere()
+    opened(1, ROUND)
+    opened(2, CUT, drips=True)
+    x, v = cloud(seed)
+    stage.put(x, v)
+    exits().mark(stage.particles, stage.neighbors.grid, time)
+    left = names(stage) == -6
+    return x[left], v[left]
+
+
+def in_some_order(points: np.ndarray) -> np.ndarray:
+    """Rows sorted by their first coordinate; threads leave drops in any order."""
+    return points[points[:, 0].argsort()]
+
+
+@pytest.mark.parametrize("age", [0.0, 0.01, 0.25])
+def test_drops_follow_the_parabola_from_where_they_left(age):
+    clear()
+    x, v = dripped(6, 0.5)
+    assert len(x) > 5
+    found = exits().drops(0.5 + age, GRAVITY, 0.3)
+    expected = x + v * age + 0.5 * GRAVITY * age**2
+    # The time of leaving is rounded too.
+    limit = ROUNDING[precision()] * (0.5 + np.abs(expected).max())
+    np.testing.assert_allclose(in_some_order(found), in_some_order(expected), rtol=0, atol=limit)
+
+
+def test_drops_are_forgotten_after_a_while_and_are_not_there_before_they_left():
+    clear()
+    early, _ = dripped(7, 0.1)
+    late, _ = dripped(8, 0.3)
+    drops = exits().drops
+    assert len(drops(0.05, GRAVITY, 1.0)) == 0
+    assert len(drops(0.2, GRAVITY, 1.0)) == len(early)
+    assert len(drops(0.35, GRAVITY, 1.0)) == len(early) + len(late)
+    assert len(drops(0.35, GRAVITY, 0.1)) == len(late)
+    assert len(drops(9.0, GRAVITY, 1.0)) == 0
+
+
+def test_only_the_latest_drops_are_remembered():
+    clear()
+    marks, total = 0, 0
+    while total <= MOST_DROPS:
+        marks += 1
+        total += len(dripped(9, 0.001 * marks)[0])
+    each = total // marks
+    shown = exits().drops(0.001 * marks, GRAVITY, 1e3)
+    assert len(shown) == MOST_DROPS
+    # All of the last ones are among them.
+    assert len(exits().drops(0.001 * marks, GRAVITY, 0.0015)) == 2 * each
+    assert exits().account()[4] == total

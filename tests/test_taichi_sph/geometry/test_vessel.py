@@ -1,0 +1,530 @@
+"""Vessels: distances, openings, mistakes in files, proxies, the blood at the start."""
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from meshes import (
+    BOTTOM,
+    LENGTH,
+    RADIUS,
+    TOP,
+    bent,
+    cylinder,
+    pipe,
+    tables,
+    write_scene,
+)
+from places import VESSELS
+from taichi_sph.errors import InputError
+from taichi_sph.geometry import mesh, wall_sampling
+from taichi_sph.geometry.interior import Interior
+from taichi_sph.geometry.vessel import Vessel, build_vessel, check_vessel, read_vessel
+from taichi_sph.scene import Column, OpeningTable, read_scene
+
+SCENES = sorted(path.relative_to(VESSELS).as_posix() for path in VESSELS.glob("*/scene.toml"))
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No test reads or writes the user's cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "vesselflow"
+
+
+@pytest.fixture(scope="module")
+def aorta() -> Vessel:
+    return read_vessel(read_scene(VESSELS / "aortoiliac" / "scene.toml"))
+
+
+def closed_vessel(vertices: np.ndarray, faces: np.ndarray) -> Vessel:
+    return Vessel(
+        np.asarray(vertices, float), np.asarray(faces, np.int32), np.full(len(faces), -1), ()
+    )
+
+
+# Distances
+
+
+def test_signed_distance_of_a_sphere() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.01)
+    vessel = closed_vessel(ball.vertices, ball.faces)
+    points = np.random.default_rng(0).uniform(-0.015, 0.015, (3000, 3))
+    exact = np.linalg.norm(points, axis=1) - 0.01
+    # Between vertices the triangles lie below the sphere by a few millionths of a metre.
+    assert np.abs(vessel.signed_distance(points) - exact).max() < 6e-6
+    clear = np.abs(exact) > 1e-5
+    assert np.array_equal(vessel.contains(points)[clear], exact[clear] < 0)
+    assert vessel.volume == pytest.approx(4 / 3 * math.pi * 0.01**3, rel=1e-3)
+
+
+def test_signed_distance_of_a_cylinder() -> None:
+    vessel = build_vessel(*cylinder(segments=144), tables(), 1.0, "tube")
+    points = np.random.default_rng(1).uniform(-0.02, 0.02, (3000, 3)) * [0.4, 0.4, 1.0]
+    radial = np.hypot(points[:, 0], points[:, 1]) - RADIUS
+    axial = np.abs(points[:, 2]) - LENGTH / 2
+    exact = np.minimum(np.maximum(radial, axial), 0) + np.hypot(
+        np.maximum(radial, 0), np.maximum(axial, 0)
+    )
+    assert np.abs(vessel.signed_distance(points) - exact).max() < 3e-6
+
+
+def test_boxes_called_inside_are_and_most_of_the_lumen_is_in_such(aorta: Vessel) -> None:
+    low, high = aorta.bounds
+    interior = Interior(low, high, aorta.volume, aorta.signed_distance)
+    random = np.random.default_rng(2)
+    for _ in range(2):  # asked for the first time, and known
+        points = random.uniform(low - 2e-3, high + 2e-3, (20_000, 3))
+        points[:2] = low, high
+        held, depth = interior.holds(points), -aorta.signed_distance(points)
+        assert depth[held].min() > 0.0
+        # A box whose middle is deeper than its half diagonal reaches half a diagonal deeper.
+        deep = depth > math.sqrt(3.0) * 1.001 * interior.size
+        assert deep.sum() > 100
+        assert held[deep].all()
+        assert not held[~aorta.contains(points)].any()
+
+
+# Openings
+
+
+@pytest.mark.parametrize("capped", [True, False])
+def test_openings_of_a_cylinder_are_found(capped: bool) -> None:
+    vessel = build_vessel(*cylinder(capped), tables(bottom="capped"), 1.0, "tube")
+    assert [o.name for o in vessel.openings] == ["top", "bottom"]
+    for opening, centre, direction in zip(vessel.openings, (TOP, BOTTOM), (1, -1), strict=True):
+        assert np.abs(opening.centre - centre).max() < 1e-7
+        assert opening.normal == pytest.approx([0, 0, direction], abs=1e-6)
+        assert opening.radius == pytest.approx(RADIUS, rel=2e-3)
+        assert opening.area == pytest.approx(math.pi * opening.radius**2)
+    assert [o.is_open for o in vessel.openings] == [True, False]
+    assert mesh.is_closed(vessel.faces.astype(np.int64))
+    assert vessel.volume == pytest.approx(math.pi * RADIUS**2 * LENGTH, rel=4e-3)
+    top = vessel.vertices[vessel.faces[vessel.face_opening == 0]]
+    assert np.abs(top[:, :, 2] - TOP[2]).max() < 1e-7
+    # The open cap carries no proxies, the capped one does.
+    walls = 2 * math.pi * RADIUS * LENGTH + math.pi * RADIUS**2
+    assert vessel.wall_area == pytest.approx(walls, rel=2e-3)
+    assert vessel.unnamed == ()
+
+
+def test_an_uneven_rim_is_carried_on_to_a_flat_cap() -> None:
+    vertices, faces = cylinder(capped=False)
+    rim = vertices[:, 2] > TOP[2] - 1e-9
+    vertices[rim, 2] += 4e-4 * np.sin(3 * np.arctan2(vertices[rim, 1], vertices[rim, 0]))
+    vessel = build_vessel(vertices, faces, tables(), 1.0, "tube")
+    cap = vessel.faces[vessel.face_opening == 0]
+    height = vessel.vertices[np.unique(cap)] @ vessel.openings[0].normal
+    assert np.ptp(height) < 1e-9
+    assert TOP[2] + 4e-4 < height.mean() < TOP[2] + 8e-4
+    assert len(mesh.self_intersections(vessel.vertices, vessel.faces.astype(int))) == 0
+
+
+def test_an_opening_that_the_scene_does_not_name_is_capped() -> None:
+    for capped in (True, False):
+        vessel = build_vessel(*cylinder(capped), {"top": tables()["top"]}, 1.0, "tube")
+        assert [o.is_open for o in vessel.unnamed] == [False]
+        assert np.abs(vessel.unnamed[0].centre - BOTTOM).max() < 1e-7
+        assert vessel.wall_area > 2 * math.pi * RADIUS * LENGTH + 0.9 * math.pi * RADIUS**2
+        assert any("not named" in f.text and not f.good for f in check_vessel(vessel))
+
+
+def test_centres_are_in_units_of_the_file() -> None:
+    vertices, faces = cylinder()
+    vessel = build_vessel(vertices, faces, tables(scale=1e-3), 1e-3, "tube")
+    assert np.abs(vessel.openings[0].centre - TOP).max() < 1e-7
+
+
+def test_an_oblique_end_is_an_opening() -> None:
+    vertices, faces = cylinder()
+    vertices[:, 2] += 0.5 * vertices[:, 0]
+    vessel = build_vessel(vertices, faces, tables(), 1.0, "tube")
+    assert vessel.openings[0].normal == pytest.approx(np.array([-0.5, 0, 1]) / math.sqrt(1.25))
+
+
+# Mistakes in files
+
+
+def no_change(vertices, faces):
+    return vertices, faces
+
+
+def with_nan(vertices, faces):
+    vertices[7] = np.nan
+    return vertices, faces
+
+
+def inside_out(vertices, faces):
+    return vertices, faces[:, ::-1]
+
+
+def one_turned(vertices, faces):
+    faces[10] = faces[10][::-1]
+    return vertices, faces
+
+
+def with_hole(vertices, faces):
+    side = np.flatnonzero(np.ptp(vertices[faces][:, :, 2], axis=1) > 1e-9)
+    return vertices, np.delete(faces, side[200], axis=0)
+
+
+def with_large_hole(vertices, faces):
+    middle = vertices[faces].mean(axis=1)
+    return vertices, faces[np.linalg.norm(middle - [RADIUS, 0, 0], axis=1) > 2e-3]
+
+
+def with_fin(vertices, faces):
+    return (
+        np.concatenate([vertices, [[0.02, 0.0, 0.0]]]),
+        np.concatenate([faces, [[*faces[5, :2], len(vertices)]]]),
+    )
+
+
+def two_pieces(vertices, faces):
+    return (
+        np.concatenate([vertices, vertices + np.array([0.03, 0, 0])]),
+        np.concatenate([faces, faces + len(vertices)]),
+    )
+
+
+def pinched(vertices, faces):
+    # Two tubes that share the middle of a cap's vertex.
+    other = vertices + np.array([0, 0, LENGTH])
+    top = int(np.argmin(np.linalg.norm(vertices - TOP, axis=1)))
+    low = int(np.argmin(np.linalg.norm(other - vertices[top], axis=1)))
+    other[:, 2] += 0.01 * (np.arange(len(other)) != low)
+    other[low] = vertices[top]
+    return np.concatenate([vertices, other]), np.concatenate([faces, faces + len(vertices)])
+
+
+def in_millimetres(vertices, faces):
+    return vertices * 1e3, faces
+
+
+def in_kilometres(vertices, faces):
+    return vertices * 1e-3, faces
+
+
+def no_faces(vertices, faces):
+    return vertices, faces[:0]
+
+
+def flat(vertices, faces):
+    sheet = vertices * [1, 1, 0]
+    return sheet + 1e-13 * vertices, faces
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (with_nan, ["1 of", "not finite", "all must be finite"]),
+        (inside_out, ["normals point inwards", "turn"]),
+        (one_turned, ["turn different ways", "outward"]),
+        (with_hole, ["hole", "3 edges", "close it"]),
+        (with_large_hole, ["hole", "the wall lies in its plane", "close it"]),
+        (with_fin, ["more than two triangles", "one or two"]),
+        (two_pieces, ["2 separate pieces", "one connected"]),
+        (pinched, ["touch at a single vertex", "separate or merge"]),
+        (in_millimetres, ["30 m across", "millimetres", "vessel.scale = 0.001"]),
+        (in_kilometres, ["3e-05 m across", "vessel.scale = 1000"]),
+        (no_faces, ["no triangles", "tube is needed"]),
+    ],
+)
+def test_a_bad_surface_is_refused_in_one_sentence(change, words, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, change(*cylinder()))
+    with pytest.raises(InputError) as error:
+        read_vessel(scene)
+    message = str(error.value)
+    assert str(tmp_path / "lumen.ply") in message
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_a_good_surface_is_not_refused(tmp_path: Path) -> None:
+    assert read_vessel(write_scene(tmp_path, no_change(*cylinder()))).volume > 0
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"not a mesh at all", b"ply\nformat ascii 1.0\nelement vertex 3\n", b"\x00" * 99],
+)
+def test_bytes_that_are_no_mesh_are_refused(content: bytes, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, content)
+    with pytest.raises(InputError, match=r"lumen\.ply: (not a readable|the surface has no)"):
+        read_vessel(scene)
+
+
+def test_a_missing_surface_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"lumen\.ply: cannot read the surface: No such file"):
+        read_vessel(write_scene(tmp_path, None))
+
+
+def test_a_wrong_or_doubled_opening_is_named(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, cylinder(), {"top": TOP, "side": (0.02, 0.0, 0.0)})
+    with pytest.raises(InputError, match=r"openings\.side: no opening of .* is at \(0\.02, 0, 0\)"):
+        read_vessel(scene)
+    scene = write_scene(tmp_path, cylinder(), {"top": TOP, "again": (0.001, 0.0, TOP[2])})
+    with pytest.raises(InputError, match=r"openings\.again: the same opening .* openings\.top"):
+        read_vessel(scene)
+
+
+def test_a_column_at_an_opening_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, cylinder(), {}, 'opening = "top"\nheight = 0.01')
+    with pytest.raises(InputError, match=r"column\.opening: 'top' is not an opening; allowed:"):
+        read_vessel(scene)
+
+
+def test_a_spacing_too_coarse_is_refused_with_one_that_is_not(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"spacing: 0\.003 m puts 3\.3 .* at most 0\.00249 m"):
+        read_vessel(write_scene(tmp_path, cylinder(), spacing=3e-3))
+    assert read_vessel(write_scene(tmp_path, cylinder(), spacing=2.4e-3)).volume > 0
+
+
+@pytest.mark.parametrize(
+    ("column", "words"),
+    [
+        (Column(opening="top", height=0.05), ["column.height: 0.05 m", "at most 0.03 m fits"]),
+        (Column(opening="top", height=0.02, offset=0.015), ["column.height", "0.015 m fits"]),
+        (Column(opening="top", height=0.01, offset=0.04), ["column.offset", "0.03 m"]),
+        (Column(opening="top", height=0.0003), ["column.height: 0.0003 m", "less than one layer"]),
+        (Column(opening="top", particles=9999), ["column.particles: 9999 do not fit", "fit"]),
+        (Column(opening="side", height=0.01), ["'side' is not an opening", "top, bottom"]),
+    ],
+)
+def test_a_column_that_does_not_fit_is_refused(column: Column, words: list[str]) -> None:
+    with pytest.raises(InputError) as error:
+        pipe().fill_column(column, 1e-3)
+    for word in words:
+        assert word in str(error.value)
+
+
+# Blood at the start
+
+
+def test_a_box_is_filled_to_the_last_place() -> None:
+    scene = read_scene(VESSELS / "box" / "scene.toml")
+    vessel = read_vessel(scene)
+    blood = vessel.fill_column(scene.column, 1e-3)
+    assert len(blood) == 16 * 16 * 20
+    assert blood.min(axis=0) == pytest.approx([-7.5e-3, -7.5e-3, -19.5e-3], abs=1e-8)
+    assert blood.max(axis=0) == pytest.approx([7.5e-3, 7.5e-3, -0.5e-3], abs=1e-8)
+
+
+@pytest.mark.parametrize("wanted", [500, 1234])
+def test_the_column_has_the_number_asked_for(aorta: Vessel, wanted: int) -> None:
+    spacing = 0.9e-3
+    column = Column(opening="inlet_abdominal_aorta", particles=wanted)
+    blood = aorta.fill_column(column, spacing)
+    assert len(blood) == wanted
+    assert len(np.unique(np.round(blood / spacing * 100), axis=0)) == wanted
+    assert aorta.signed_distance(blood).max() <= -0.499 * spacing
+    opening = aorta.openings[0]
+    depth = (opening.centre - blood) @ opening.normal
+    assert depth.min() == pytest.approx(0.5 * spacing)
+    # As shallow as can be: it fills all layers but its last.
+    full = aorta.fill_column(
+        Column(opening="inlet_abdominal_aorta", height=depth.max() - 0.4 * spacing), spacing
+    )
+    assert len(full) <= wanted
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_shipped_scenes_fill_strictly_inside_and_leak_nothing(name: str) -> None:
+    scene = read_scene(VESSELS / name)
+    vessel = read_vessel(scene)
+    spacing = scene.discretization.spacing
+    blood = vessel.fill_column(scene.column, spacing)
+    assert 3000 <= len(blood) <= 6000
+    assert vessel.signed_distance(blood).max() <= -0.498 * spacing
+    assert vessel.count_leaks(blood) == 0
+    assert vessel.narrowest / spacing > 6.0
+    # The column stands below its opening: gravity points into the lumen there.
+    opening = vessel.opening(scene.column.opening)
+    gravity = np.array(scene.gravity)
+    assert gravity @ opening.normal < -0.5 * np.linalg.norm(gravity)
+    assert all(finding.good for finding in check_vessel(vessel))
+
+
+@pytest.mark.parametrize("name", ["aortoiliac/A.toml", "portal_vein/B.toml"])
+def test_scenes_of_the_papers_sizes_hold_16_000_and_32_000(name: str) -> None:
+    scene = read_scene(VESSELS / name)
+    vessel = read_vessel(scene)
+    spacing, column = scene.discretization.spacing, scene.column
+    assert column.particles == 16_000
+    proxies = vessel.wall_area / (spacing * scene.discretization.wall_spacing_ratio) ** 2
+    assert proxies == pytest.approx(56_000 if "A" in name else 73_000, rel=0.02)
+    twice = vessel.fill_column(Column(opening=column.opening, particles=32_000), spacing)
+    assert len(twice) == 32_000
+
+
+def test_a_column_stays_in_the_leg_of_its_opening() -> None:
+    vertices, faces = bent()
+    ends = [
+        mesh.region_plane(vertices, faces[region])[0]
+        for region in mesh.flat_regions(vertices, faces)
+    ]
+    left, right = sorted(ends, key=lambda centre: centre[0])
+    openings = {
+        name: OpeningTable(centre=tuple(centre)) for name, centre in (("a", left), ("b", right))
+    }
+    vessel = build_vessel(vertices, faces, openings, 1.0, "bend")
+    blood = vessel.fill_column(Column(opening="a", height=0.004), 1e-3)
+    assert blood[:, 0].max() < 0  # not in the other leg, though it is as deep there
+    both = vessel.fill_column(Column(opening="a", particles=1800), 1e-3)
+    assert both[:, 0].max() > 0  # round the bend
+
+
+# Leaks
+
+
+def test_leaks_are_counted_against_the_mesh() -> None:
+    vessel = pipe(bottom="capped")
+    outside = np.array(
+        [
+            [0.0, 0.0, 0.0],  # within
+            [RADIUS + 1e-4, 0.0, 0.0],  # through the wall
+            [0.0, 0.0, TOP[2] + 1e-3],  # out of the open end
+            [0.0, 0.0, BOTTOM[2] - 1e-3],  # through the cap
+            [RADIUS + 1e-4, 0.0, TOP[2] - 1e-3],  # beside the open end, not beyond it
+            [0.0, 0.0, TOP[2] + 1.0],  # far beyond: nobody can say how it came there
+        ]
+    )
+    assert [vessel.count_leaks(point[None]) for point in outside] == [0, 1, 0, 1, 1, 1]
+    assert vessel.count_leaks(outside) == 4
+    assert vessel.count_leaks(outside, tolerance=2e-4) == 2
+    assert vessel.count_leaks(np.zeros((0, 3))) == 0
+
+
+# Wall
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.5])
+def test_proxies_are_even_set_back_and_of_the_right_number(aorta: Vessel, ratio: float) -> None:
+    spacing, setback = 0.9e-3 * ratio, 0.45e-3
+    wall = aorta.sample_wall(spacing, setback, seed=3)
+    assert len(wall.positions) + wall.dropped == round(aorta.wall_area / spacing**2)
+    assert len(wall.positions) == pytest.approx(aorta.wall_area / spacing**2, rel=0.02)
+    assert wall.nearest_spread < 0.07
+    assert 0.85 < wall.nearest_mean < 1.0
+    assert wall.nearest_least > 0.6
+    assert wall.largest_gap < 0.95
+    assert np.linalg.norm(wall.normals, axis=1) == pytest.approx(1.0)
+    distance = aorta.signed_distance(wall.positions)
+    assert distance.min() > 0.4 * setback
+    assert distance.max() < 1.01 * setback
+    assert np.median(distance) == pytest.approx(setback, rel=0.01)
+    for opening in aorta.openings:
+        apart = wall.positions - opening.centre
+        near = np.linalg.norm(apart, axis=1) < 2 * opening.radius
+        height = apart[near] @ opening.normal
+        # Flush: none beyond the plane, some right at it.
+        assert height.max() <= 1e-7
+        assert height.max() > -0.5 * spacing
+
+
+def test_gaps_are_what_an_independent_search_finds(aorta: Vessel) -> None:
+    spacing = 1e-3
+    points, nearest = wall_sampling.even_points(aorta.vertices, aorta.wall_faces, spacing, 0)
+    corners = aorta.vertices[aorta.wall_faces[nearest]]
+    normal = mesh.unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    assert np.abs(np.einsum("ij,ij->i", points - corners[:, 0], normal)).max() < 1e-9
+    probes, _ = trimesh.sample.sample_surface(
+        trimesh.Trimesh(aorta.vertices, aorta.wall_faces, process=False), 40_000, seed=5
+    )
+    gap = np.sqrt(((probes[:, None] - points[None, ::40]) ** 2).sum(axis=2)).min(axis=1)
+    assert gap.max() > 2 * spacing  # every 40th point leaves holes: the measure sees them
+    figures = wall_sampling.evenness(points, aorta.vertices, aorta.wall_faces, spacing)
+    thinned = wall_sampling.evenness(points[::2], aorta.vertices, aorta.wall_faces, spacing)
+    assert thinned[3] > 1.0 > figures[3]
+
+
+def test_a_capped_opening_carries_proxies_and_an_open_one_does_not() -> None:
+    wall = pipe(bottom="capped").sample_wall(1e-3, 0.5e-3)
+    on_axis = np.hypot(wall.positions[:, 0], wall.positions[:, 1]) < 0.8 * RADIUS
+    assert (wall.positions[on_axis][:, 2] < BOTTOM[2]).all()
+    assert on_axis.sum() == pytest.approx(0.64 * math.pi * RADIUS**2 / 1e-6, rel=0.1)
+
+
+def test_proxies_of_a_bend_that_nearly_touches_itself_are_dropped() -> None:
+    # Two plates a third of a setback apart outside: proxies of one stand in the other's lumen.
+    vertices, faces = bent(1.999 * np.pi)
+    vessel = build_vessel(vertices, faces, {}, 1.0, "ring")
+    setback = 0.5e-3
+    wall = vessel.sample_wall(1e-3, setback)
+    assert wall.dropped > 50  # the two ends face each other a few micrometres apart
+    assert vessel.signed_distance(wall.positions).min() > 0.4 * setback
+
+
+def test_sampling_repeats_to_the_last_bit_and_follows_the_seed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    first = pipe().sample_wall(1e-3, 0.5e-3, seed=1)
+    again = pipe().sample_wall(1e-3, 0.5e-3, seed=1)
+    other = pipe().sample_wall(1e-3, 0.5e-3, seed=2)
+    assert first.positions.tobytes() == again.positions.tobytes()
+    assert first.normals.tobytes() == again.normals.tobytes()
+    assert not np.array_equal(first.positions, other.positions)
+
+
+def test_the_cache_gives_the_same_points_and_survives_damage(
+    monkeypatch: pytest.MonkeyPatch, own_cache: Path
+) -> None:
+    monkeypatch.setattr(wall_sampling, "_CACHE_FROM", 0)
+    first = pipe().sample_wall(1e-3, 0.5e-3)
+    (file,) = own_cache.iterdir()
+    calls = []
+    real = wall_sampling.even_points
+
+    def counted(*given):
+        calls.append(given)
+        return real(*given)
+
+    monkeypatch.setattr(wall_sampling, "even_points", counted)
+    stored = pipe().sample_wall(1e-3, 0.5e-3)
+    assert not calls
+    assert stored.positions.tobytes() == first.positions.tobytes()
+    assert stored.largest_gap == first.largest_gap
+    pipe(bottom="capped").sample_wall(1e-3, 0.5e-3)
+    pipe().sample_wall(1e-3, 0.4e-3)
+    assert len(calls) == 2  # another wall or setback has another key
+    for damage in (b"", file.read_bytes()[:300], b"garbage" * 50):
+        calls.clear()
+        file.write_bytes(damage)
+        again = pipe().sample_wall(1e-3, 0.5e-3)
+        assert len(calls) == 1
+        assert again.positions.tobytes() == first.positions.tobytes()
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(wall_sampling, "_CACHE_FROM", 0)
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", os.fspath(blocked))
+    assert len(pipe().sample_wall(1e-3, 0.5e-3).positions) > 900
+
+
+# Narrowest place
+
+
+def test_the_narrowest_place_is_the_throat_and_not_a_blind_end(aorta: Vessel) -> None:
+    stenosis = read_vessel(read_scene(VESSELS / "stenosis" / "scene.toml"))
+    assert stenosis.narrowest == pytest.approx(5e-3, rel=0.02)
+    assert pipe().narrowest == pytest.approx(2 * RADIUS, rel=0.01)
+    # The stubs of the basilar artery end at 0.7 mm; its way through is wider.
+    basilar = read_vessel(read_scene(VESSELS / "basilar_bifurcation" / "scene.toml"))
+    assert 1.5e-3 < basilar.narrowest < 2 * min(o.radius for o in basilar.openings)
+    assert aorta.narrowest == pytest.approx(2 * 4.2e-3, rel=0.05)
+
+
+def test_the_check_names_triangles_that_cross() -> None:
+    vertices, faces = cylinder()
+    vertices[np.argmax(vertices[:, 0] - np.abs(vertices[:, 2])), 0] = -7e-3
+    findings = check_vessel(build_vessel(vertices, faces, tables(), 1.0, "tube"))
+    assert [f.good for f in findings if "cut through" in f.text] == [False]
