@@ -243,7 +243,7 @@ def run(
 
     import hashlib
 
-    from app.models import maker_of
+    from app.models import model_factory
     from app.progress import Progress
     from app.run.checkpoint import Checkpoint, Checkpointer
     from app.run.loop import Observer, drive
@@ -258,7 +258,7 @@ def run(
         scene = advice.method.scene(scene)
         maker = advice.method.maker(scene)
     else:
-        maker = maker_of(model, scene, weights)
+        maker = model_factory(model, scene, weights)
     facts = {
         "scene": scene.name, "scene_text": scene.text, "particles": particles, "height": height,
         "model": model, "arch": arch, "precision": precision, "seed": seed, "version": version(),
@@ -284,7 +284,7 @@ def run(
         )  # fmt: skip
         observers.append(acting)
     elif begun is not None:
-        simulation.go_on_from(begun.state)
+        simulation.load_state(begun.state)
     if rrd is not None or live is not None:
         from app.view.rerun_view import RerunView
 

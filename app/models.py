@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from taichi_sph.scene import Scene
-    from taichi_sph.simulation import ModelMaker
+    from taichi_sph.simulation import ModelFactory
 
 MODELS = ("physics", "implicit", "pcnet")
 
 
-def maker_of(
+def model_factory(
     name: str, scene: "Scene", weights: Path | None = None, guarded: bool = True
-) -> "ModelMaker":
+) -> "ModelFactory":
     """What makes a model for a scene.
 
     Args:
@@ -25,9 +25,9 @@ def maker_of(
         InputError: weights that cannot be read.
     """
     if name == "implicit":
-        from taichi_sph.fluid.implicit import implicit_for
+        from taichi_sph.fluid.implicit import implicit_factory
 
-        return implicit_for(scene)
+        return implicit_factory(scene)
     if name == "pcnet":
         from app.scenes.library import weights_for
         from nn.pcnet import load_pcnet

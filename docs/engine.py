@@ -9,21 +9,21 @@ import sys
 
 import numpy as np
 
-from app.models import maker_of
+from app.models import model_factory
 from app.scenes.library import find_scene
 from taichi_sph import Simulation, start
-from taichi_sph.runtime import number
+from taichi_sph.runtime import float_dtype
 
 scene = find_scene(sys.argv[1])
 seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 0.2
 start(arch="cpu")
-simulation = Simulation.from_scene(scene, maker_of("pcnet", scene))
-physics = simulation.model_of(maker_of("physics", scene))
-simulation.rehearse([simulation.model, physics])  # compile now, not when it is needed
+simulation = Simulation.from_scene(scene, model_factory("pcnet", scene))
+physics = simulation.make_model(model_factory("physics", scene))
+simulation.compile_kernels([simulation.model, physics])  # compile now, not when it is needed
 
 room = simulation.particles.capacity
 identity = np.zeros(room, np.int32)
-position, velocity = np.zeros((2, room, 3), number())
+position, velocity = np.zeros((2, room, 3), float_dtype())
 
 # A place on the wall half way along, and one inside for the tool.
 vertices = simulation.vessel.vertices

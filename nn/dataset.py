@@ -22,8 +22,8 @@ target exists where a particle is alive at both ends of the interval and is 0 el
 `target` and `features` are stored on demand; `Run.target` works the former out otherwise.
 
 Numbers are stored as the simulation has them, in single precision; one chunk is one frame,
-compressed, with a Fletcher-32 checksum.  `Facts` lists the attributes of a run.  Split by run,
-never by sample: neighbouring frames are nearly the same.
+compressed, with a Fletcher-32 checksum.  `RunMetadata` lists the attributes of a run.  Split by
+run, never by sample: neighbouring frames are nearly the same.
 """
 
 import errno
@@ -56,7 +56,7 @@ Rows = int | slice
 
 
 @dataclass(frozen=True)
-class Facts:
+class RunMetadata:
     """What a run is about: its attributes in the file, the same in every recording of it."""
 
     scene: str
@@ -117,7 +117,7 @@ class Proxies:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class RecordedState:
     """The blood at a frame; a particle is a row, all zeros once it has left."""
 
     position: np.ndarray
@@ -148,7 +148,7 @@ def mean_acceleration(
 
 
 def layout(
-    facts: Facts, proxies: int, feature_count: int
+    facts: RunMetadata, proxies: int, feature_count: int
 ) -> dict[str, tuple[tuple[int, ...], type, str]]:
     """Shape, type and unit of every dataset of a run; targets are kept beside features."""
     f, n = facts.frames, facts.particles
@@ -170,7 +170,7 @@ def layout(
     return table
 
 
-def size_of(facts: Facts, feature_count: int) -> int:
+def size_of(facts: RunMetadata, feature_count: int) -> int:
     """Bytes of a run before compression, proxies left out."""
     table = layout(facts, 0, feature_count)
     return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind, _ in table.values())
@@ -197,24 +197,24 @@ def _require_room(path: Path, size: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
-def _write_facts(group: h5py.Group, facts: Facts) -> None:
+def _write_metadata(group: h5py.Group, facts: RunMetadata) -> None:
     for name, value in asdict(facts).items():
         group.attrs[name] = value
         if name in UNITS:
             group.attrs[f"{name}_unit"] = UNITS[name]
 
 
-def _read_facts(group: h5py.Group, where: str) -> Facts:
+def _read_metadata(group: h5py.Group, where: str) -> RunMetadata:
     values = {}
-    for field in fields(Facts):
+    for field in fields(RunMetadata):
         if field.name not in group.attrs:
             raise InputError(f"{where}: the attribute {field.name} is missing")
         value = group.attrs[field.name]
         values[field.name] = value.item() if isinstance(value, np.generic) else value
-    return Facts(**values)
+    return RunMetadata(**values)
 
 
-def require_same(found: Facts, wanted: Facts, where: str, advice: str) -> None:
+def require_same(found: RunMetadata, wanted: RunMetadata, where: str, advice: str) -> None:
     """Refuse a file about another run than the one asked for.
 
     Raises:
@@ -230,7 +230,7 @@ def require_same(found: Facts, wanted: Facts, where: str, advice: str) -> None:
             raise InputError(f"{where}: holds a run of {what}; {advice}")
 
 
-def committed_states(path: Path, facts: Facts) -> int:
+def committed_states(path: Path, facts: RunMetadata) -> int:
     """States of a run that are safe in the file of a `RunWriter`; 0 if there is no file yet.
 
     Raises:
@@ -243,9 +243,9 @@ def committed_states(path: Path, facts: Facts) -> int:
         return int(file["committed"][0])
 
 
-def _require_run(file: h5py.File, facts: Facts, path: Path) -> None:
+def _require_run(file: h5py.File, facts: RunMetadata, path: Path) -> None:
     advice = "delete it, or record the same run to go on"
-    require_same(_read_facts(file, str(path)), facts, str(path), advice)
+    require_same(_read_metadata(file, str(path)), facts, str(path), advice)
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ class RunWriter:
     is written last, when the rows are on the disk.
     """
 
-    def __init__(self, path: Path, facts: Facts, proxies: Proxies, feature_count: int = 0):
+    def __init__(self, path: Path, facts: RunMetadata, proxies: Proxies, feature_count: int = 0):
         """Begin a run, or go on with the one in the file.
 
         Raises:
@@ -328,12 +328,12 @@ class RunWriter:
         """States that are safely in the file; a run has frames + 1."""
         return int(self._get("committed", 0)[0])
 
-    def state(self, frame: int) -> State:
+    def state(self, frame: int) -> RecordedState:
         """A state that has been committed."""
         position, velocity, alive = (
             self._get(name, frame)[0] for name in ("position", "velocity", "alive")
         )
-        return State(position, velocity, alive.astype(bool))
+        return RecordedState(position, velocity, alive.astype(bool))
 
     def steps(self) -> int:
         """Sub-steps up to the last state."""
@@ -341,7 +341,7 @@ class RunWriter:
 
     def append(
         self,
-        state: State,
+        state: RecordedState,
         acceleration: np.ndarray,
         features: np.ndarray | None,
         substeps: Substeps,
@@ -403,10 +403,10 @@ class RunWriter:
         self.close()
 
 
-def _lay_out(file: h5py.File, facts: Facts, proxies: Proxies, feature_count: int) -> None:
+def _lay_out(file: h5py.File, facts: RunMetadata, proxies: Proxies, feature_count: int) -> None:
     """Everything that a run will fill, at its final place in the file."""
     file.attrs.update(format=PART, schema=SCHEMA)
-    _write_facts(file, facts)
+    _write_metadata(file, facts)
     place = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     place.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     table = layout(facts, len(proxies.volume), feature_count)
@@ -557,7 +557,7 @@ class Run:
         self.name: str = group.name.rsplit("/", 1)[-1]
         self._group = group
         self._where = f"{path}: runs/{self.name}"
-        self.facts = _read_facts(group, self._where)
+        self.facts = _read_metadata(group, self._where)
         proxies = group["proxy_volume"].shape[0] if "proxy_volume" in group else 0
         width = group["features"].shape[-1] if "features" in group else 0
         for name, (shape, kind, unit) in layout(self.facts, proxies, width).items():
@@ -622,9 +622,9 @@ class Run:
         """Whether a particle is in the vessel, bool, (n,) or (frames, n)."""
         return self._read("alive", frame).astype(bool)
 
-    def state(self, frame: int) -> State:
+    def state(self, frame: int) -> RecordedState:
         """The blood at a frame."""
-        return State(self.position(frame), self.velocity(frame), self.alive(frame))
+        return RecordedState(self.position(frame), self.velocity(frame), self.alive(frame))
 
     def acceleration(self, frame: Rows) -> np.ndarray:
         """Mean over the interval before [m/s^2]: a_i^n of the frame."""
@@ -731,14 +731,16 @@ def check(path: Path) -> None:
         for run in data.runs:
             where = f"{path}: runs/{run.name}"
             run.proxies()
-            before: State | None = None
+            before: RecordedState | None = None
             for frame in range(len(run) + 1):
                 now = run.state(frame)
                 _check_state(run, frame, before, now, where)
                 before = now
 
 
-def _check_state(run: Run, frame: int, before: State | None, now: State, where: str) -> None:
+def _check_state(
+    run: Run, frame: int, before: RecordedState | None, now: RecordedState, where: str
+) -> None:
     """Refuse a frame that is not what the schema promises."""
     at = f"frame {frame}"
     rows = {"position": now.position, "velocity": now.velocity}

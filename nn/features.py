@@ -262,7 +262,7 @@ def features_of(
             f[21] = shape3[0]
             f[22] = shape3[1]
     # d(rho_i)/dt = sum_j m slope r_ij.v_ij, and r_ij.v_ij = r_ji.v_ji.
-    share = ti.static(fluid.calibration.mass / fluid.state.rest_density)
+    share = ti.static(fluid.calibration.mass / fluid.equation_of_state.rest_density)
     gamma = ti.static(fluid.calibration.wall_density)
     f[25] = share * blood + gamma * behind
     f[23] = 50.0 * ti.max(0.0, f[25] - 1.0)

@@ -29,7 +29,7 @@ import numpy as np
 import taichi as ti
 
 from nn.features import FeatureScales, Inputs, features_of
-from nn.weights import CLIP, Weights, proportions, require_fit
+from nn.weights import CLIP, Weights, dimensionless_numbers, require_fit
 from taichi_sph.fluid.implicit import (
     DAMPING,
     LARGEST_ADVANCE,
@@ -172,13 +172,13 @@ class DirectPcNet:
         self.physics = SphAcceleration(fluid, capacity)
         self.guarded = guarded
         """Whether the physics may take over."""
-        self.fell_back = False
+        self.used_fallback = False
         self.next_acceleration = ti.Vector.field(3, float, capacity)
 
     @property
-    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
         """Forces come from pairs only where the physics took over."""
-        return self.physics.pairwise if self.fell_back else None
+        return self.physics.pair_coefficients if self.used_fallback else None
 
     def accelerate(
         self,
@@ -192,15 +192,15 @@ class DirectPcNet:
             particles, wall, neighbors, self.fluid, self.scales, self.network,
             self.next_acceleration,
         )  # fmt: skip
-        self.fell_back = self.guarded and alarms > 0
-        if self.fell_back:
+        self.used_fallback = self.guarded and alarms > 0
+        if self.used_fallback:
             self.physics.accelerate(particles, wall, neighbors, gravity)
         else:
             copy_vectors(particles, self.next_acceleration)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """The trained step [s], or less: LARGEST_ADVANCE at most, or the physics' own."""
-        if self.fell_back:
+        if self.used_fallback:
             return self.physics.stable_step(largest_speed, largest_acceleration)
         return step_within_reach(
             self.scales.frame_interval, self.scales.support_radius, largest_speed
@@ -249,7 +249,7 @@ def make_pcnet(
 
 def scales_of(weights: Weights, fluid: Fluid, spacing: float, wall_ratio: float) -> FeatureScales:
     """What features are measured in where blood is `fluid` at a spacing [m]."""
-    radius, sound = fluid.kernel.support_radius, fluid.state.sound_speed
+    radius, sound = fluid.kernel.support_radius, fluid.equation_of_state.sound_speed
     interval = weights.training.courant_number * radius / sound
     return FeatureScales(radius, spacing, interval, sound, wall_ratio)
 
@@ -264,7 +264,7 @@ def load_pcnet(path: Path, scene: Scene, guarded: bool = True) -> Callable[[Flui
     grid = scene.discretization
 
     def make(fluid: Fluid, capacity: int) -> PcNet:
-        found = {"support_ratio": grid.support_ratio, **proportions(fluid)}
+        found = {"support_ratio": grid.support_ratio, **dimensionless_numbers(fluid)}
         require_fit(weights, str(path), found)
         scales = scales_of(weights, fluid, grid.spacing, grid.wall_spacing_ratio)
         return make_pcnet(weights, fluid, scales, capacity, guarded)
@@ -298,7 +298,7 @@ def predict_acceleration(
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, network.inputs)
         alarms += beyond_training(f, p.velocity[i], scales)
-        p.density[i] = f[25] * ti.static(fluid.state.rest_density)
+        p.density[i] = f[25] * ti.static(fluid.equation_of_state.rest_density)
         o = evaluate(network, f)
         for a in ti.static(range(3)):
             out[i][a] = o[a] * ti.static(scales.acceleration)
@@ -337,16 +337,19 @@ def predict_pressure(
 
     Writes: pressure_term, viscosity, response, density.
     """
-    rest_density = ti.static(fluid.state.rest_density)
+    rest_density = ti.static(fluid.equation_of_state.rest_density)
     thickest = ti.static(
-        LARGEST_VISCOSITY * fluid.state.rest_density * scales.support_radius * scales.speed_limit
+        LARGEST_VISCOSITY
+        * fluid.equation_of_state.rest_density
+        * scales.support_radius
+        * scales.speed_limit
     )
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, network.inputs)
         p.density[i] = f[25] * rest_density
-        response[i] = ti.static(fluid.state.rest_density / scales.speed_limit**2) * ti.max(
-            LEAST_RESPONSE, f[26]
-        )
+        response[i] = ti.static(
+            fluid.equation_of_state.rest_density / scales.speed_limit**2
+        ) * ti.max(LEAST_RESPONSE, f[26])
         o = evaluate(network, f)
         excess = largest_stiffness * sigmoid(o[0]) * (f[25] - 1.0)
         excess -= largest_damping * sigmoid(o[1]) * f[24]

@@ -75,7 +75,7 @@ class Training:
         return Inputs(tuple(NAMES.index(name) for name in self.inputs))
 
 
-def proportions(fluid: Fluid) -> dict[str, float]:
+def dimensionless_numbers(fluid: Fluid) -> dict[str, float]:
     """The numbers of a liquid that a network depends on; see `Training`."""
     return {
         "artificial_viscosity": fluid.artificial_viscosity,

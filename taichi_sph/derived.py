@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_sph.boundary.wall_motion import read_pulse
-from taichi_sph.fluid.rheology import rheology_of
+from taichi_sph.boundary.wall_motion import read_wall_motion
+from taichi_sph.fluid.rheology import make_rheology
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.scene import Scene
 from taichi_sph.waveform import read_waveform
@@ -58,7 +58,7 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
             flow += float(np.abs(wave * (table.flow or 0.0)).max())
     jet = math.sqrt(2.0 * (head + (highest - lowest) / scene.blood.density))
     squeezed = 0.0
-    pulse = read_pulse(scene, vessel)
+    pulse = read_wall_motion(scene, vessel)
     if pulse is not None:
         area = sum(opening.area for opening in vessel.openings if opening.is_open)
         speed = pulse.swing * pulse.fastest
@@ -76,7 +76,7 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
     # Without gravity nothing drives the blood but itself: 1 m/s, an arterial speed, then.
     sound = grid.sound_speed_ratio * (speed or 1.0)
     h = 0.5 * radius
-    viscosity = rheology_of(scene.blood.rheology).largest_viscosity
+    viscosity = make_rheology(scene.blood.rheology).largest_viscosity
     step = min(
         grid.courant_number * h / (sound + speed), 0.125 * h * h * scene.blood.density / viscosity
     )

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from taichi_sph.boundary.inflow import Gates
+from taichi_sph.boundary.inflow import BufferRegions
 from taichi_sph.particles.wall import wall_velocity
 
 WALL_MARGIN = 0.1
@@ -16,7 +16,7 @@ behind a thin septum lies another branch, whose blood must not be pulled over.""
 class NoPlugs:
     """Nothing drives blood."""
 
-    gates = Gates()
+    gates = BufferRegions()
 
 
 NO_PLUGS = NoPlugs()
@@ -34,7 +34,7 @@ def is_finite(a):
 
 
 @ti.kernel
-def survey(p: ti.template()) -> ti.math.vec3:
+def largest_speed_and_acceleration(p: ti.template()) -> ti.math.vec3:
     """Largest speed [m/s], largest acceleration [m/s^2], number of non-finite particles."""
     speed2 = 0.0
     acceleration2 = 0.0
@@ -85,9 +85,9 @@ def kick_drift(
             x += v_new * dt
         walls = nb.wall_count[i]
         if ti.static(plugs.gates.count > 0):
-            plug = plugs.gates.plug_of(x_old)
+            plug = plugs.gates.buffer_at(x_old)
             if plug >= 0:
-                v_new = plugs.speed[plug] * plugs.gates.way_in(plug)
+                v_new = plugs.speed[plug] * plugs.gates.inward_normal(plug)
                 x = x_old + v_new * dt
                 walls = 0
         near2 = ti.static((0.75 * w.spacing) ** 2)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from taichi_sph.boundary.inflow import Pistons
+from taichi_sph.boundary.inflow import BufferZones
 from taichi_sph.errors import RunError
 from taichi_sph.fluid.wcsph import AccelerationModel
-from taichi_sph.integrator import NO_PLUGS, NoPlugs, kick_drift, survey
+from taichi_sph.integrator import NO_PLUGS, NoPlugs, kick_drift, largest_speed_and_acceleration
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall
@@ -46,7 +46,7 @@ class Motion:
         """Simulated time for which the model fell back to the physics [s]."""
         self.step_limit = math.inf
         """Longest step allowed beside the model's own limit [s]."""
-        self.plugs: Pistons | NoPlugs = NO_PLUGS
+        self.plugs: BufferZones | NoPlugs = NO_PLUGS
         """What drives blood through openings."""
         self._wall_moved = 0.0
         """How far a proxy may have moved since the lists were built [m]."""
@@ -64,7 +64,7 @@ class Motion:
             self.neighbors.build(self.particles, self.wall)
             self._wall_moved = 0.0
         self.model.accelerate(self.particles, self.wall, self.neighbors, self.gravity)
-        speed, acceleration, broken = survey(self.particles)
+        speed, acceleration, broken = largest_speed_and_acceleration(self.particles)
         if broken or speed > self.speed_limit:
             raise RunError(self._diagnosis(int(broken)))
         stable = min(self.model.stable_step(speed, acceleration), self.step_limit)
@@ -79,7 +79,7 @@ class Motion:
         self._stale = moved + max(moved, self._wall_moved) > self.neighbors.skin
         self.wall_corrections += int(corrected)
         self.last_step = dt
-        self.fallback_time += dt * self.model.fell_back
+        self.fallback_time += dt * self.model.used_fallback
         self.time += dt
         self.steps += 1
 

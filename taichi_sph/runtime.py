@@ -12,7 +12,7 @@ ARCHITECTURES = ("cpu", "gpu")
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 
 
-def number() -> type[np.floating]:
+def float_dtype() -> type[np.floating]:
     """The numpy type of a kernel's `float`."""
     return np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
 

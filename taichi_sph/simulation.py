@@ -9,17 +9,24 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taichi_sph.boundary.inflow import LEAST_APART, Piston, Pistons, add_blood, plug_sites, sleeve
-from taichi_sph.boundary.outlets import LOST, SUCTION, Exits
+from taichi_sph.boundary.inflow import (
+    LEAST_APART,
+    BufferZones,
+    DrivenOpening,
+    add_blood,
+    buffer_sites,
+    flow_extension,
+)
+from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION, Outlets
 from taichi_sph.boundary.surgery import MOST_WOUNDS, Surgery, Wound
 from taichi_sph.boundary.tool import Tool, read_shape
-from taichi_sph.boundary.wall_motion import read_pulse
+from taichi_sph.boundary.wall_motion import read_wall_motion
 from taichi_sph.derived import Derived, derive
 from taichi_sph.diagnostics import Diagnostics, diagnose
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.fluid.calibration import calibrate
 from taichi_sph.fluid.equation_of_state import Tait
-from taichi_sph.fluid.rheology import rheology_of
+from taichi_sph.fluid.rheology import make_rheology
 from taichi_sph.fluid.wcsph import AccelerationModel, Fluid, SphAcceleration, force_on_tool
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.motion import Motion
@@ -27,11 +34,11 @@ from taichi_sph.particles.neighbors import Neighbors, cells_within, make_grid
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
-from taichi_sph.runtime import number
+from taichi_sph.runtime import float_dtype
 from taichi_sph.scene import Scene
 from taichi_sph.waveform import read_waveform
 
-ModelMaker = Callable[[Fluid, int], AccelerationModel]
+ModelFactory = Callable[[Fluid, int], AccelerationModel]
 """Makes a model for a fluid and a number of particles."""
 
 SKIN = 0.1
@@ -47,7 +54,7 @@ DROP_TIME = 0.3
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class State:
     """All that changes from step to step; rows in the order of the grid."""
 
     time: float
@@ -78,7 +85,11 @@ class Simulation(Motion):
     """Blood of a scene in its vessel."""
 
     def __init__(
-        self, scene: Scene, vessel: Vessel, make_model: ModelMaker = SphAcceleration, seed: int = 0
+        self,
+        scene: Scene,
+        vessel: Vessel,
+        make_model: ModelFactory = SphAcceleration,
+        seed: int = 0,
     ):
         """Sample the wall, fill the column and set up the model (the physics by default).
 
@@ -92,10 +103,10 @@ class Simulation(Motion):
         setback = calibration.setback
         self.scene = scene
         self.vessel = vessel
-        plugs = Pistons(
+        plugs = BufferZones(
             make_pistons(scene, vessel), grid.spacing, kernel.support_radius, scene.blood.density
         )
-        self.pulse = read_pulse(scene, vessel)
+        self.pulse = read_wall_motion(scene, vessel)
         sample = vessel.sample_wall(wall_spacing, setback, seed)
         proxies, normals = [sample.positions], [sample.normals]
         swings = [np.zeros(len(sample.positions))]
@@ -103,7 +114,7 @@ class Simulation(Motion):
             swings = [self.pulse.reach(vessel, sample.positions - setback * sample.normals)]
         for piston in plugs.each:
             rim = vessel.rim(vessel.openings.index(piston.opening))
-            tube = sleeve(rim, piston.opening, wall_spacing, setback, plugs.gates.depth)
+            tube = flow_extension(rim, piston.opening, wall_spacing, setback, plugs.gates.depth)
             proxies.append(tube[0])
             normals.append(tube[1])
             swings.append(np.zeros(len(tube[0])))
@@ -126,8 +137,8 @@ class Simulation(Motion):
         self.derived: Derived = derive(scene, vessel, len(blood), sum(map(len, proxies)))
         self.fluid = Fluid(
             kernel=kernel,
-            state=Tait(scene.blood.density, self.derived.sound_speed),
-            rheology=rheology_of(scene.blood.rheology),
+            equation_of_state=Tait(scene.blood.density, self.derived.sound_speed),
+            rheology=make_rheology(scene.blood.rheology),
             calibration=calibration,
             artificial_viscosity=scene.blood.artificial_viscosity,
             courant_number=grid.courant_number,
@@ -168,7 +179,7 @@ class Simulation(Motion):
         if plugs.each:
             self.plugs = plugs
         self._pistons = plugs
-        self.exits = Exits(len(vessel.openings) + MOST_WOUNDS)
+        self.exits = Outlets(len(vessel.openings) + MOST_WOUNDS)
         for k, opening in enumerate(vessel.openings):
             if opening.is_open:
                 driven = scene.openings[opening.name].driven
@@ -188,7 +199,7 @@ class Simulation(Motion):
 
     @classmethod
     def from_scene(
-        cls, scene: Scene, make_model: ModelMaker = SphAcceleration, seed: int = 0
+        cls, scene: Scene, make_model: ModelFactory = SphAcceleration, seed: int = 0
     ) -> "Simulation":
         """Read the vessel of a scene and set everything up.
 
@@ -237,7 +248,7 @@ class Simulation(Motion):
         self.particles.replace(identity=identity, position=position, velocity=velocity)
         self._stale = True
 
-    def snapshot(self) -> Snapshot:
+    def save_state(self) -> State:
         """A copy of the state; the lists are built anew at the next step.
 
         A simulation that goes on from the copy builds them too: both then add up in the same order
@@ -254,7 +265,7 @@ class Simulation(Motion):
             "wall": [self.wall.level, self.wall.rate],
             **self.surgery.state(),
         }
-        return Snapshot(
+        return State(
             self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections,
             controls, self.exits.account(),
             *(
@@ -263,7 +274,7 @@ class Simulation(Motion):
             ),
         )  # fmt: skip
 
-    def go_on_from(self, state: Snapshot) -> None:
+    def load_state(self, state: State) -> None:
         """Go on from a state of the same scene, under the model that it names.
 
         Raises:
@@ -292,33 +303,33 @@ class Simulation(Motion):
         self.gravity = (x, y, z)
         self.added, self._next_identity = controls["added"], controls["next_identity"]
         for piston, row in zip(self._pistons.each, controls["pistons"], strict=True):
-            piston.go_on_from(row)
-        self.surgery.go_on_from(controls)
+            piston.load_state(row)
+        self.surgery.load_state(controls)
         self.neighbors.move_wall(self.wall, *controls["wall"])
         self._stale = True
 
-    def switch(self, model: AccelerationModel) -> None:
-        """Let another model, made by `model_of`, compute accelerations from now on."""
+    def use_model(self, model: AccelerationModel) -> None:
+        """Let another model, made by `make_model`, compute accelerations from now on."""
         self.model = model
 
-    def model_of(self, make_model: ModelMaker) -> AccelerationModel:
+    def make_model(self, make_model: ModelFactory) -> AccelerationModel:
         """A model for this simulation; its fields stay in memory for good."""
         return make_model(self.fluid, self.particles.capacity)
 
-    def rehearse(self, models: list[AccelerationModel]) -> None:
+    def compile_kernels(self, models: list[AccelerationModel]) -> None:
         """Have models compile what they need, before anybody waits for it; nothing moves."""
         self.neighbors.build(self.particles, self.wall)
         for model in models:
             acceleration = self.particles.acceleration.to_numpy()
             model.accelerate(self.particles, self.wall, self.neighbors, self.gravity)
             self.particles.acceleration.from_numpy(acceleration)
-            if self.wall.tool and model.pairwise is not None:
-                force_on_tool(self.particles, self.wall, self.neighbors, *model.pairwise)
-        self.surgery.rehearse(self.particles)
+            if self.wall.tool and model.pair_coefficients is not None:
+                force_on_tool(self.particles, self.wall, self.neighbors, *model.pair_coefficients)
+        self.surgery.compile_kernels(self.particles)
         self._stale = True
 
     @property
-    def pistons(self) -> list[Piston]:
+    def pistons(self) -> list[DrivenOpening]:
         """What drives the openings."""
         return self._pistons.each
 
@@ -391,7 +402,7 @@ class Simulation(Motion):
                 )
             added = add_blood(
                 self.particles, self._pistons.gates,
-                *(np.ascontiguousarray(a, number()) for a in (position, velocity)),
+                *(np.ascontiguousarray(a, float_dtype()) for a in (position, velocity)),
                 np.zeros(len(position), np.int32), self._next_identity,
                 (LEAST_APART * self.scene.discretization.spacing) ** 2,
             )  # fmt: skip
@@ -402,8 +413,10 @@ class Simulation(Motion):
         """Move plugs, tool and wall by a step of dt [s]."""
         if self._pistons.each:
             self._pistons.advance(self.particles, self.time, dt, self.gravity)
-        if self.wall.tool and self.model.pairwise is not None:
-            force = force_on_tool(self.particles, self.wall, self.neighbors, *self.model.pairwise)
+        if self.wall.tool and self.model.pair_coefficients is not None:
+            force = force_on_tool(
+                self.particles, self.wall, self.neighbors, *self.model.pair_coefficients
+            )
             self._impulse += dt * np.array([force[0], force[1], force[2]])
             self._impulse_time += dt
         self._wall_moved += self.surgery.before_drift(dt) + self._pulse_until(self.time + dt)
@@ -451,14 +464,14 @@ class Simulation(Motion):
             # Blood in the hole has not leaked.
             held &= wound.distance(x) > wound.radius + 3.0 * self.scene.discretization.spacing
         swung = self.wall.level * self.wall.most_swing
-        leaks = self.vessel.count_leaks(x[held], swung) + int(account[LOST])
+        leaks = self.vessel.count_leaks(x[held], swung) + int(account[OUT_OF_BOX])
         return diagnose(
             self, density, drained, leaks,
             added=self.added, bled=int(exits[len(names) :].sum()), sucked=int(account[SUCTION]),
         )  # fmt: skip
 
 
-def make_pistons(scene: Scene, vessel: Vessel) -> list[Piston]:
+def make_pistons(scene: Scene, vessel: Vessel) -> list[DrivenOpening]:
     """What drives the openings of a scene.
 
     Raises:
@@ -468,14 +481,14 @@ def make_pistons(scene: Scene, vessel: Vessel) -> list[Piston]:
     for k, opening in enumerate(vessel.openings):
         table = scene.openings[opening.name]
         if table.driven:
-            sites = plug_sites(vessel.rim(k), opening, scene.discretization.spacing)
+            sites = buffer_sites(vessel.rim(k), opening, scene.discretization.spacing)
             if len(sites) == 0:
                 raise InputError(
                     f"openings.{opening.name}: too narrow to be driven at spacing "
                     f"{scene.discretization.spacing:g} m"
                 )
             waveform = read_waveform(table.waveform, Path(scene.folder))
-            pistons.append(Piston(opening, table.flow, table.pressure, waveform, sites))
+            pistons.append(DrivenOpening(opening, table.flow, table.pressure, waveform, sites))
     return pistons
 
 

@@ -19,7 +19,7 @@ from app.control.channel import Channel
 from app.control.page import ControlPage
 from app.control.session import Session
 from app.files import table
-from app.models import maker_of
+from app.models import model_factory
 from app.view.rerun_view import RerunView
 from taichi_sph.runtime import start
 from taichi_sph.scene import Scene
@@ -73,7 +73,7 @@ def measure_overhead(
     needs to draw that is not counted, nor is a viewer.
     """
     start(arch, "f32", threads)
-    simulation = Simulation.from_scene(scene, maker_of("pcnet", scene, weights))
+    simulation = Simulation.from_scene(scene, model_factory("pcnet", scene, weights))
     session = Session(simulation, {}, folder / "session.jsonl")
     view = RerunView(simulation, None, _free_port())
     sides: dict[bool, list[float]] = {False: [], True: []}
@@ -92,11 +92,11 @@ def measure_overhead(
                 raise RuntimeError("bench --control: its own client does not reach the page")
             time.sleep(0.1)
         simulation.advance_to(SETTLED * scene.frame_interval)
-        state = simulation.snapshot()
+        state = simulation.save_state()
         for pair in range(-1, pairs):
             for acted in (False, True) if pair % 2 else (True, False):
                 # Both do the same work: a tool without a shape moves no blood.
-                simulation.go_on_from(state)
+                simulation.load_state(state)
                 sent, steps, began = page.pictures, simulation.steps, time.perf_counter()
                 if acted:
                     session.before_step()

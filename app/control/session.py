@@ -34,14 +34,14 @@ from app.control.commands import (
     parse_command,
 )
 from app.files import write_text
-from app.models import MODELS, maker_of
+from app.models import MODELS, model_factory
 from app.progress import Progress
 from app.run.loop import Observer, drive
 from app.scenes.library import weights_for, with_column
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.runtime import start
 from taichi_sph.scene import Scene, parse_scene
-from taichi_sph.simulation import ModelMaker, Simulation, Snapshot
+from taichi_sph.simulation import ModelFactory, Simulation, State
 
 if TYPE_CHECKING:
     from app.run.checkpoint import Checkpoint
@@ -91,7 +91,7 @@ class Session:
     def __init__(
         self,
         simulation: "Simulation",
-        makers: "dict[str, ModelMaker]",
+        makers: "dict[str, ModelFactory]",
         log: Path | None = None,
         facts: dict[str, Any] | None = None,
         script: Iterable[tuple[float, AnyCommand]] = (),
@@ -116,8 +116,8 @@ class Session:
         self.models: dict[str, AccelerationModel] = {simulation.model.name: simulation.model}
         for name, maker in makers.items():
             if name not in self.models:
-                self.models[name] = simulation.model_of(maker)
-        simulation.rehearse(list(self.models.values()))
+                self.models[name] = simulation.make_model(maker)
+        simulation.compile_kernels(list(self.models.values()))
         self._waiting: queue.Queue[tuple[AnyCommand, str, float]] = queue.Queue(MOST_WAITING)
         self._script = sorted(script, key=lambda entry: entry[0])
         self.recorded: list[Entry] = []
@@ -150,11 +150,11 @@ class Session:
             except OSError as error:
                 raise InputError(f"{log}: cannot be written: {error.strerror}") from None
 
-    def go_on_from(self, state: "Snapshot", kept: "Kept") -> None:
+    def load_state(self, state: "State", kept: "Kept") -> None:
         """Go on from a state of this session; commands that came after it are done again."""
         simulation = self.simulation
-        simulation.switch(self.models[state.controls["model"]])
-        simulation.go_on_from(state)
+        simulation.use_model(self.models[state.controls["model"]])
+        simulation.load_state(state)
         for entry in kept.entries:
             by_hand = isinstance(entry.command, Model) and entry.source != "auto"
             if by_hand and entry.step < state.steps:
@@ -311,7 +311,7 @@ class Session:
         elif isinstance(command, Model):
             self.auto = command.name == "auto"
             self._auto_until, self._auto_time, self._stood_in = simulation.time, 0.0, 0.0
-            simulation.switch(self.models["pcnet" if self.auto else command.name])
+            simulation.use_model(self.models["pcnet" if self.auto else command.name])
         elif isinstance(command, Tool):
             low, high = self._bounds
             x, y, z = map(max, low, map(min, command.position, high))
@@ -389,7 +389,7 @@ class Session:
 
     def _choose(self, name: str) -> None:
         if self.simulation.model.name != name:
-            self.simulation.switch(self.models[name])
+            self.simulation.use_model(self.models[name])
             self._note(Model(name=name), "auto")  # type: ignore[arg-type]
 
     def _write(self, line: dict[str, Any]) -> None:
@@ -569,7 +569,7 @@ class Comparer:
                 self.first_difference = frame
         every = self.kept.facts.get("checkpoint")
         if every and frame % every == 0:
-            simulation.snapshot()  # after which the lists are built anew, as they were then
+            simulation.save_state()  # after which the lists are built anew, as they were then
 
     def close(self, ending: str) -> None:
         """Nothing."""
@@ -577,9 +577,9 @@ class Comparer:
 
 def _models(
     names: Iterable[str], scene: "Scene", weights: Path | None
-) -> "tuple[dict[str, ModelMaker], dict[str, Any]]":
+) -> "tuple[dict[str, ModelFactory], dict[str, Any]]":
     """Makers of models by name, and for the log what the network's weights were."""
-    makers = {n: maker_of(n, scene, weights) for n in MODELS if n in names or "auto" in names}
+    makers = {n: model_factory(n, scene, weights) for n in MODELS if n in names or "auto" in names}
     file = (weights or weights_for(scene)).resolve()
     of = {"file": str(file), "hash": hashlib.sha256(file.read_bytes()).hexdigest()}
     return makers, {"network": of if "pcnet" in makers else None}
@@ -615,7 +615,7 @@ def open_session(
     before = kept.until(begun.frame, begun.state.steps) if begun is not None else []
     session = Session(simulation, makers, log, facts | head, entries, before)
     if begun is not None:
-        session.go_on_from(begun.state, kept)
+        session.load_state(begun.state, kept)
     return session
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from app.files import write_bytes
 from taichi_sph.errors import InputError
-from taichi_sph.simulation import Snapshot
+from taichi_sph.simulation import State
 
 if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics
@@ -31,7 +31,7 @@ class Checkpoint:
     facts: dict[str, Any]
     """What the run is of; another run cannot go on from here."""
     frame: int
-    state: Snapshot
+    state: State
 
     def write(self, path: Path) -> None:
         """Write the file, whole or not at all.
@@ -60,7 +60,7 @@ class Checkpoint:
                 if head["format"] != FORMAT:
                     raise KeyError("format")
                 arrays = {name: file[name] for name in file.files if name != "head"}
-            state = Snapshot(**head["numbers"], **arrays)
+            state = State(**head["numbers"], **arrays)
             return cls(head["facts"], head["frame"], state)
         except FileNotFoundError:
             raise InputError(f"--resume {path}: there is no such file") from None
@@ -103,7 +103,7 @@ class Checkpointer:
         """
         if frame % self.every == 0:
             try:
-                Checkpoint(self.facts, frame, simulation.snapshot()).write(self.path)
+                Checkpoint(self.facts, frame, simulation.save_state()).write(self.path)
             except OSError as error:
                 raise OSError(
                     f"{self.path}: the checkpoint cannot be written: {error.strerror}"

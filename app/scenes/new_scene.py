@@ -123,7 +123,7 @@ def _tidy(
     vertices, faces = mesh.clean(vertices, faces)
     if len(faces) == 0:
         raise InputError(f"{label}: all triangles have collapsed to lines; a tube is needed")
-    count, piece = mesh.pieces(faces, len(vertices))
+    count, piece = mesh.components(faces, len(vertices))
     if count > 1:
         area = np.linalg.norm(mesh.face_vectors(vertices, faces), axis=1)
         share = np.bincount(piece, area) / area.sum()
@@ -134,7 +134,7 @@ def _tidy(
             )
         vertices, faces = mesh.drop_unused(vertices, faces[piece == share.argmax()])
         notes.append(f"left out: {count - 1} small loose pieces, {100 * (1 - share.max()):.2g} %")
-    if not mesh.is_oriented(faces) and (mesh.edge_uses(faces)[2] <= 2).all():
+    if not mesh.is_winding_consistent(faces) and (mesh.edge_uses(faces)[2] <= 2).all():
         faces = np.ascontiguousarray(igl.bfs_orient(faces)[0], np.int64)
         notes.append("normals: neighbouring triangles turned different ways; made to agree")
     require_manifold(vertices, faces, label)

@@ -22,7 +22,7 @@ from app.jobs import in_own_process
 from app.progress import Progress, duration
 from app.studies.methods import FLOOR, METHODS, PEERS, REFERENCE, Method, of_weights
 from app.studies.splishsplash import require_peer
-from app.studies.timed_run import RULES, Errors, Grid, Pour, Rules, Trace, errors_of
+from app.studies.timed_run import RULES, Errors, Grid, Rules, TimedRun, Trace, errors_of
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import Scene
 
@@ -138,7 +138,7 @@ def check_end(scene: Scene, until: float) -> None:
         )
 
 
-def pour(job: Job, rules: Rules | None) -> tuple[Pour, float]:
+def pour(job: Job, rules: Rules | None) -> tuple[TimedRun, float]:
     """Pour; needs a process of its own.  With what the yardstick took meanwhile, median [ms]."""
     from taichi_sph.runtime import start
 
@@ -148,7 +148,7 @@ def pour(job: Job, rules: Rules | None) -> tuple[Pour, float]:
     interval = job.scene.frame_interval
     simulation = job.method.simulation(job.scene)
     grid = _grid_of(job.scene, simulation)
-    poured = Pour(job.method.name, simulation, Trace(interval), grid, rules)
+    poured = TimedRun(job.method.name, simulation, Trace(interval), grid, rules)
     tick, ticks = _yardstick(), []
     progress = Progress(job.until, f"{job.scene.name}, {job.method.name}")
     for frame in range(1, job.frames + 1):

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 
 from app.files import console, write_json
-from app.models import maker_of
+from app.models import model_factory
 from app.progress import Progress
-from app.studies.timed_run import Pour, Trace, errors_of
+from app.studies.timed_run import TimedRun, Trace, errors_of
 from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.scene import Scene
@@ -51,7 +51,7 @@ class Result:
     """Largest kinetic energy [J]."""
 
 
-def result_of(one: Pour, first: Pour) -> Result:
+def result_of(one: TimedRun, first: TimedRun) -> Result:
     """Measure a pour against the first."""
     errors = errors_of(one.trace, first.trace)
     frames = min(len(one.seconds), len(first.seconds))
@@ -78,21 +78,21 @@ def result_of(one: Pour, first: Pour) -> Result:
 
 def contestants(
     scene: Scene, vessel: Vessel, weights: list[Path], soft: list[float], seed: int
-) -> list[Pour]:
+) -> list[TimedRun]:
     """The physics, the implicit model, networks, and the physics at lower sound speeds.
 
     Raises:
         InputError: weights that do not fit.
     """
 
-    def stand(name: str, of: Scene, make: Callable[..., Any] = SphAcceleration) -> Pour:
-        return Pour(name, Simulation(of, vessel, make, seed), Trace(scene.frame_interval))
+    def stand(name: str, of: Scene, make: Callable[..., Any] = SphAcceleration) -> TimedRun:
+        return TimedRun(name, Simulation(of, vessel, make, seed), Trace(scene.frame_interval))
 
-    runs = [stand(name, scene, maker_of(name, scene)) for name in ("physics", "implicit")]
+    runs = [stand(name, scene, model_factory(name, scene)) for name in ("physics", "implicit")]
     for path in weights:
         file = path.with_suffix("").as_posix()
         name = "pcnet" if len(weights) == 1 else f"pcnet, {'/'.join(file.split('/')[-2:])}"
-        runs.append(stand(name, scene, maker_of("pcnet", scene, path)))
+        runs.append(stand(name, scene, model_factory("pcnet", scene, path)))
     for ratio in soft:
         grid = msgspec.structs.replace(scene.discretization, sound_speed_ratio=ratio)
         softer = msgspec.structs.replace(scene, discretization=grid)
@@ -135,7 +135,7 @@ def compare(
     return results
 
 
-def as_json(scene: Scene, runs: list[Pour], results: list[Result]) -> dict[str, Any]:
+def as_json(scene: Scene, runs: list[TimedRun], results: list[Result]) -> dict[str, Any]:
     """Results and curves."""
     derived = runs[0].simulation.derived
     rows = []
@@ -183,7 +183,7 @@ def print_results(scene: Scene, results: list[Result]) -> None:
             print(f"{result.name}: {result.died}")
 
 
-def draw(scene: Scene, runs: list[Pour], path: Path) -> None:
+def draw(scene: Scene, runs: list[TimedRun], path: Path) -> None:
     """Draw drained part and compression over time."""
     from matplotlib.figure import Figure
 

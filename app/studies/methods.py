@@ -10,16 +10,16 @@ from typing import Any
 import msgspec
 import taichi as ti
 
-from app.models import maker_of
+from app.models import model_factory
 from app.studies.splishsplash import SOLVERS, Peer
 from nn.weights import Weights
-from taichi_sph.fluid.implicit import implicit_for
+from taichi_sph.fluid.implicit import implicit_factory
 from taichi_sph.fluid.wcsph import AccelerationModel, Fluid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall
 from taichi_sph.scene import NewtonianTable, Scene
-from taichi_sph.simulation import ModelMaker, Simulation
+from taichi_sph.simulation import ModelFactory, Simulation
 
 
 @dataclass(frozen=True)
@@ -83,18 +83,18 @@ class Method:
             return Peer(scene, self.model, self.step_factor or 1.0)
         return Simulation.from_scene(scene, self.maker(scene))
 
-    def maker(self, scene: Scene) -> ModelMaker:
+    def maker(self, scene: Scene) -> ModelFactory:
         """What makes the model, for a scene as `scene` gives it.
 
         Raises:
             InputError: weights that cannot be read.
         """
         if self.model == "ballistic":
-            own: ModelMaker = Ballistic
+            own: ModelFactory = Ballistic
         elif self.model == "implicit" and self.rounds is not None:
-            own = implicit_for(scene, rounds=self.rounds)
+            own = implicit_factory(scene, rounds=self.rounds)
         else:
-            own = maker_of(self.model, scene, self.weights, self.guarded)
+            own = model_factory(self.model, scene, self.weights, self.guarded)
         factor = self.step_factor or 1.0
         if factor == 1.0:
             return own
@@ -112,14 +112,14 @@ class Stretched:
         self.accelerate = model.accelerate
 
     @property
-    def fell_back(self) -> bool:
+    def used_fallback(self) -> bool:
         """As the model's."""
-        return self.model.fell_back
+        return self.model.used_fallback
 
     @property
-    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
         """As the model's."""
-        return self.model.pairwise
+        return self.model.pair_coefficients
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """The model's step times the factor [s]."""
@@ -130,8 +130,8 @@ class Ballistic:
     """Free fall, and the wall's last defence: what a method must beat to be worth its name."""
 
     name = "ballistic"
-    fell_back = False
-    pairwise = None
+    used_fallback = False
+    pair_coefficients = None
 
     def __init__(self, fluid: Fluid, capacity: int):
         """It keeps nothing but the liquid."""
@@ -145,11 +145,11 @@ class Ballistic:
         gravity: tuple[float, float, float],
     ) -> None:
         """a_i = g."""
-        fall(particles, ti.Vector(gravity), self.fluid.state.rest_density)
+        fall(particles, ti.Vector(gravity), self.fluid.equation_of_state.rest_density)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """A fifth of the support radius at the largest speed, or at a hundredth of sound's [s]."""
-        slowest = 0.01 * self.fluid.state.sound_speed
+        slowest = 0.01 * self.fluid.equation_of_state.sound_speed
         return 0.2 * self.fluid.kernel.support_radius / max(largest_speed, slowest)
 
 

@@ -20,7 +20,7 @@ from app.files import console, read_rows, table, write_rows
 from app.models import MODELS
 from app.scenes.library import find_scene
 from app.studies.methods import SOFT, Method, of_weights
-from app.studies.timed_run import RULES, Pour, Trace
+from app.studies.timed_run import RULES, TimedRun, Trace
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
@@ -40,7 +40,7 @@ JITTER = 0.02
 class Trial:
     """One method from one start of a case."""
 
-    pour: Pour
+    pour: TimedRun
     start: Start
     case: "Case"
 
@@ -351,7 +351,7 @@ def _trial(simulation: Simulation, filled: np.ndarray, job: Job, k: int) -> Row:
         x = x + JITTER * d * generator.uniform(-1.0, 1.0, x.shape)
     simulation.place(x, v)
     interval = case.until / FRAMES
-    pour = Pour(job.method.name, simulation, Trace(interval), rules=RULES)
+    pour = TimedRun(job.method.name, simulation, Trace(interval), rules=RULES)
     for frame in range(1, FRAMES + 1):
         pour.frame(frame * interval)
         if pour.death or pour.empty:

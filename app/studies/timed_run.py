@@ -215,7 +215,7 @@ def errors_of(trace: Trace, reference: Trace) -> Errors:
 
 
 @dataclass
-class Pour:
+class TimedRun:
     """A simulation that is poured frame by frame, timed and judged; what has died stays so."""
 
     name: str

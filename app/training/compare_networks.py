@@ -20,11 +20,11 @@ import numpy as np
 from app.files import console, table, write_json
 from nn.dataset import Dataset
 from nn.features import COUNT, NAMES
-from nn.training.train import Course, Settings, train_weights, use_threads
+from nn.training.train import Settings, TrainingRuns, train_weights, use_threads
 from nn.weights import CLIP, Weights
 from taichi_sph.errors import InputError
 
-Fit = Callable[[Course, Settings], Weights]
+Fit = Callable[[TrainingRuns, Settings], Weights]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,9 @@ class Rung:
     """Makes the weights without a training; `settings` then only says what they are."""
 
 
-def linear(course: Course, settings: Settings, matrix: np.ndarray, offset: np.ndarray) -> Weights:
+def linear(
+    course: TrainingRuns, settings: Settings, matrix: np.ndarray, offset: np.ndarray
+) -> Weights:
     """A direct network without hidden layers: a = matrix F + offset, both in R/T^2."""
     wide = 1e6 / CLIP  # nothing is clipped
     return Weights(
@@ -49,12 +51,12 @@ def linear(course: Course, settings: Settings, matrix: np.ndarray, offset: np.nd
     )
 
 
-def persistence(course: Course, settings: Settings) -> Weights:
+def persistence(course: TrainingRuns, settings: Settings) -> Weights:
     """a_i^{n+1} = a_i^n."""
     return linear(course, settings, np.eye(3, COUNT), np.zeros(3))
 
 
-def ridge(course: Course, settings: Settings) -> Weights:
+def ridge(course: TrainingRuns, settings: Settings) -> Weights:
     """Ridge regression of the target on the 23 features, by their own deviations."""
     features, target = course.examples(32)
     x = features[:, :COUNT].astype(np.float64)
@@ -130,7 +132,7 @@ def measure(task: Task) -> dict[str, Any]:
     settings = replace(rung.settings, seed=task.seed, iterations=task.iterations)
     with Dataset(task.data) as file:
         last = len(file.runs) - 1
-        course = Course(file, [0, last])
+        course = TrainingRuns(file, [0, last])
         before = time.perf_counter()
         if rung.fit is None:
             with tempfile.TemporaryDirectory() as folder:

@@ -24,9 +24,9 @@ from app import version
 from app.files import check_output
 from app.progress import Progress, duration
 from nn import dataset
-from nn.dataset import Facts, Proxies, RunWriter, State
+from nn.dataset import Proxies, RecordedState, RunMetadata, RunWriter
 from nn.features import COUNT, TABLE_VERSION, FeatureScales
-from nn.training.rollout import Stage
+from nn.training.rollout import ReplaySimulation
 from taichi_sph.derived import derive
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry.vessel import read_vessel
@@ -44,7 +44,7 @@ class Task:
     number: int
     scene: Scene
     """With the run's own column."""
-    facts: Facts
+    facts: RunMetadata
     part: Path
     """The run's file while it is under way."""
     threads: int | None
@@ -55,7 +55,7 @@ class Recording:
     """What was recorded."""
 
     out: Path
-    runs: tuple[Facts, ...]
+    runs: tuple[RunMetadata, ...]
     resumed: int
     """States that were there already."""
     size: int
@@ -179,7 +179,7 @@ def plan(
         )
         blood = vessel.fill_column(column, scene.discretization.spacing)
         derived = derive(scene, vessel, len(blood), 0)
-        facts = Facts(
+        facts = RunMetadata(
             scene=scene.text,
             scene_name=scene.name,
             scene_folder=scene.folder,
@@ -212,11 +212,11 @@ def plan(
     return tasks
 
 
-def _feature_count(facts: Facts) -> int:
+def _feature_count(facts: RunMetadata) -> int:
     return COUNT if facts.feature_version else 0
 
 
-def _require_recorded(out: Path, runs: Sequence[Facts]) -> None:
+def _require_recorded(out: Path, runs: Sequence[RunMetadata]) -> None:
     """Refuse to write over a dataset; the one that is wanted may stay.
 
     Raises:
@@ -262,7 +262,7 @@ def record_run(task: Task, report: Callable[[int, int], None]) -> None:
     """
     facts = task.facts
     start(facts.architecture, "f32", task.threads, random_seed=facts.seed)
-    simulation = Stage(task.scene, read_vessel(task.scene), facts.seed)
+    simulation = ReplaySimulation(task.scene, read_vessel(task.scene), facts.seed)
     scales = FeatureScales(
         facts.support_radius, facts.spacing, facts.frame_interval, facts.sound_speed,
         task.scene.discretization.wall_spacing_ratio,
@@ -271,7 +271,7 @@ def record_run(task: Task, report: Callable[[int, int], None]) -> None:
     proxies = Proxies(*(f.to_numpy() for f in (wall.position, wall.normal, wall.volume)))
     with RunWriter(task.part, facts, proxies, _feature_count(facts)) as writer:
         there = writer.committed
-        before: State | None = None
+        before: RecordedState | None = None
         if there:
             before = writer.state(there - 1)
             simulation.restore(before, (there - 1) * facts.frame_interval, writer.steps())

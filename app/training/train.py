@@ -49,7 +49,7 @@ def train(
     check_output(curves, "--out", b"{")
 
     from nn.dataset import Dataset
-    from nn.training.train import Course, train_weights, use_threads
+    from nn.training.train import TrainingRuns, train_weights, use_threads
     from taichi_sph.runtime import start
 
     use_threads(threads)
@@ -61,7 +61,9 @@ def train(
         print(f"{figures}  ({duration(at.seconds)}, {duration(left)} left)", file=sys.stderr)
 
     with Dataset(data) as file:
-        weights, history = train_weights(Course(file, held_out), out, settings, command, report)
+        weights, history = train_weights(
+            TrainingRuns(file, held_out), out, settings, command, report
+        )
     write_json(curves, {"command": command, "validations": history})
     if plot is not None:
         draw(history, plot)

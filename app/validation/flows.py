@@ -64,7 +64,7 @@ class Liquid:
         """The constants of the sums."""
         return Fluid(
             kernel=self.kernel,
-            state=Tait(DENSITY, self.sound_speed, self.background_pressure),
+            equation_of_state=Tait(DENSITY, self.sound_speed, self.background_pressure),
             rheology=self.rheology,
             calibration=calibrate(self.kernel, self.spacing, self.wall_spacing, DENSITY),
             artificial_viscosity=self.artificial_viscosity,
@@ -90,10 +90,11 @@ def state_of(motion: Motion) -> State:
     return State(*(p.in_order(f).astype(float) for f in (p.position, p.velocity, p.density)))
 
 
-def pressure_of(density: np.ndarray, state: Tait) -> np.ndarray:
+def pressure_of(density: np.ndarray, equation_of_state: Tait) -> np.ndarray:
     """Tait's pressure [Pa] in double precision, bounded below as the simulation bounds it."""
-    p = state.stiffness * ((density / state.rest_density) ** state.gamma - 1.0)
-    return np.maximum(0.0, p + state.background_pressure)
+    ratio = density / equation_of_state.rest_density
+    p = equation_of_state.stiffness * (ratio**equation_of_state.gamma - 1.0)
+    return np.maximum(0.0, p + equation_of_state.background_pressure)
 
 
 def make_motion(

@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from nn.dataset import State, Substeps
+from nn.dataset import RecordedState, Substeps
 from nn.features import GATHERED, FeatureScales, extract
 from taichi_sph.errors import InputError
 from taichi_sph.fluid.wcsph import Fluid, SphAcceleration, sum_density
@@ -12,7 +12,7 @@ from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 
 
-class Stage(Simulation):
+class ReplaySimulation(Simulation):
     """A simulation whose future is a function of what a frame stores, and of nothing else.
 
     Lists that are built once in some steps sum in an order that depends on where blood was then.
@@ -63,7 +63,7 @@ class Stage(Simulation):
         self.neighbors.build(self.particles, self.wall)
         self._stale = False
 
-    def state(self) -> State:
+    def state(self) -> RecordedState:
         """The blood, a row for each particle of the start."""
         particles = self.particles
         identity = particles.identity.to_numpy()[: particles.count[None]]
@@ -75,9 +75,9 @@ class Stage(Simulation):
             rows.append(np.zeros((len(alive), 3), values.dtype))
             rows[-1][identity] = values
         position, velocity = rows
-        return State(position, velocity, alive)
+        return RecordedState(position, velocity, alive)
 
-    def restore(self, state: State, time: float, steps: int) -> None:
+    def restore(self, state: RecordedState, time: float, steps: int) -> None:
         """Go back, or on, to a state at a time [s] after a number of steps."""
         rows = np.flatnonzero(state.alive)
         self.put(rows, state.position[rows], state.velocity[rows])

@@ -30,8 +30,8 @@ import torch
 from nn.dataset import Dataset, Run, mean_acceleration
 from nn.features import COUNT, NAMES, FeatureScales
 from nn.pcnet import LARGEST_EXPONENT, PcNet, largest_factors, make_pcnet
-from nn.training.rollout import Stage
-from nn.weights import CLIP, Training, Weights, proportions
+from nn.training.rollout import ReplaySimulation
+from nn.weights import CLIP, Training, Weights, dimensionless_numbers
 from taichi_sph.diagnostics import FEW, compression
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.fluid.calibration import softening
@@ -87,12 +87,12 @@ class Settings:
     """Gradient steps between two rollouts on the held-out run."""
 
 
-class Sample:
+class TrainingSample:
     """A state with its features, the geometry of its pairs and the acceleration wanted."""
 
     def __init__(
         self,
-        stage: Stage,
+        stage: ReplaySimulation,
         scales: FeatureScales,
         target: np.ndarray,
         valid: np.ndarray,
@@ -113,7 +113,7 @@ class Sample:
         x = particles.position.to_numpy()[:n].astype(np.float64)
         v = particles.velocity.to_numpy()[:n].astype(np.float64)
         ratio = self.features[:, 25].numpy().astype(np.float64)
-        density = ratio * fluid.state.rest_density
+        density = ratio * fluid.equation_of_state.rest_density
         i, j = _entries(nb.blood_count.to_numpy()[:n], nb.blood_index.to_numpy()[:n])
         r = x[i] - x[j]
         r2 = (r**2).sum(axis=1)
@@ -127,7 +127,7 @@ class Sample:
         # d(rho_i/rho_0)/dt = squeeze (sum_j push (v_i - v_j) + wall_push v_i).
         self.velocity = _f32(v)
         self.thickness = _f32(np.log(stage.viscosity() / fluid.rheology.eta))
-        self.squeeze = -1.0 / (factors.gradient * fluid.state.rest_density)
+        self.squeeze = -1.0 / (factors.gradient * fluid.equation_of_state.rest_density)
         self.push = _f32((-factors.gradient * slope)[:, None] * r)
         drag = 2.0 * factors.viscosity * slope * r2 / (r2 + eps)
         self.drag = _f32((drag / (density[i] * density[j]))[:, None] * v_ij)
@@ -138,7 +138,7 @@ class Sample:
         r = x[i] - stage.wall.position.to_numpy()[k]
         r2 = (r**2).sum(axis=1)
         share = (
-            fluid.state.rest_density
+            fluid.equation_of_state.rest_density
             * stage.wall.volume.to_numpy()[k]
             * kernel.slope_of(np.sqrt(r2))
         )
@@ -207,7 +207,9 @@ class Model(torch.nn.Module):
             y = torch.nn.functional.softsign(layer(y))
         return self.layers[-1](y) * self.scale
 
-    def step(self, sample: Sample, rest_density: float, eta: float, gravity: torch.Tensor) -> Step:
+    def step(
+        self, sample: TrainingSample, rest_density: float, eta: float, gravity: torch.Tensor
+    ) -> Step:
         """What a step does to every particle, as `PcNet` does it."""
         t = self.training_facts
         o = self.outputs(sample.features)
@@ -256,7 +258,7 @@ class Model(torch.nn.Module):
         )
 
 
-class Course:
+class TrainingRuns:
     """Recorded runs to learn from, some held out, and a stage for their frames."""
 
     def __init__(self, file: Dataset, held_out: Sequence[int]):
@@ -271,7 +273,7 @@ class Course:
         facts = self.facts = self.runs[0].facts
         largest = max((*self.runs, *self.held), key=lambda run: run.facts.particles)
         self.scene = largest.scene
-        self.stage = Stage(self.scene, read_vessel(self.scene), largest.facts.seed)
+        self.stage = ReplaySimulation(self.scene, read_vessel(self.scene), largest.facts.seed)
         low, high = self.stage.vessel.bounds
         self.extent = float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
         """Diagonal of the vessel's box [m]."""
@@ -283,7 +285,7 @@ class Course:
 
     def training(self, settings: Settings, command: str) -> Training:
         """What a network trained here is to remember."""
-        facts, liquid = self.facts, proportions(self.stage.fluid)
+        facts, liquid = self.facts, dimensionless_numbers(self.stage.fluid)
         return Training(
             head=settings.head,
             inputs=INPUTS[settings.head] if settings.inputs is None else settings.inputs,
@@ -383,7 +385,7 @@ class Course:
             if not n:
                 break
             density = stage.particles.density.to_numpy()[:n]
-            p99, _ = compression(density, stage.fluid.state.rest_density)
+            p99, _ = compression(density, stage.fluid.equation_of_state.rest_density)
             worst = max(worst, p99)
             if not p99 < DIED:
                 break
@@ -423,7 +425,7 @@ class Progress:
 
 
 def train_weights(
-    course: Course,
+    course: TrainingRuns,
     out: Path,
     settings: Settings,
     command: str = "",
@@ -445,7 +447,7 @@ def train_weights(
     generator = np.random.default_rng(settings.seed)
     began = time.perf_counter()
     fluid, direct = course.stage.fluid, settings.head == "direct"
-    density, eta = fluid.state.rest_density, fluid.rheology.eta
+    density, eta = fluid.equation_of_state.rest_density, fluid.rheology.eta
     training = course.training(settings, command)
     # Gravity joins the pressure head's sums; the direct head learns it or nothing does.
     gravity = torch.tensor((0.0, 0.0, 0.0) if direct else course.scene.gravity)
@@ -512,13 +514,13 @@ def train_weights(
 
 
 def _draw(
-    course: Course,
+    course: TrainingRuns,
     settings: Settings,
     iteration: int,
     generator: np.random.Generator,
     net: PcNet,
     model: Model,
-) -> Sample | None:
+) -> TrainingSample | None:
     """The sample of a gradient step; None if the network drifted beyond what can be simulated."""
     run = course.runs[generator.integers(len(course.runs))]
     correct = settings.correction == "periodic" and iteration % PERIOD == 0
@@ -535,7 +537,7 @@ def _draw(
             net.network.load(model.weights())
             course.drive(net, min(drift, len(run) - 1 - frame))
             frame = min(frame + drift, len(run) - 1)
-        sample = Sample(
+        sample = TrainingSample(
             course.stage, course.scales, run.target(frame), run.has_target(frame),
             pairs=settings.head != "direct",
         )  # fmt: skip

@@ -32,21 +32,21 @@ from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Floats, Integers, inside_polygon, plane_axes
 from taichi_sph.geometry.openings import Opening
 from taichi_sph.particles.particles import Particles
-from taichi_sph.runtime import has_wide_atomics, number
+from taichi_sph.runtime import float_dtype, has_wide_atomics
 from taichi_sph.waveform import Waveform
 
-RISE = 0.05
+RAMP_TIME = 0.05
 """Time in which a flow or a pressure rises from nothing to what is asked for [s]: blood that is
 set going at once rings."""
 
-SLACK = 0.25
+HYSTERESIS = 0.25
 """A particle leaves the plug this far beyond its end [spacings], and another takes its place only
 when the column has come back by as much: blood that trembles adds and removes nothing."""
 
 LEAST_APART = 0.5
 """No particle is added nearer to another than this [spacings]."""
 
-FINE = float(1 << 20)
+FIXED_POINT_SCALE = float(1 << 20)
 """Accelerations are summed as whole multiples of 1/FINE m/s^2: the order then does not matter."""
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -55,7 +55,7 @@ GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 @ti.data_oriented
 @dataclass(frozen=True)
-class Gates:
+class BufferRegions:
     """Where the plugs are."""
 
     centre: tuple[tuple[float, float, float], ...] = ()
@@ -73,7 +73,7 @@ class Gates:
         return len(self.centre)
 
     @ti.func
-    def plug_of(self, x):
+    def buffer_at(self, x):
         """Number of the plug that a position belongs to; -1 if to none."""
         found = -1
         for k in ti.static(range(self.count)):
@@ -85,7 +85,7 @@ class Gates:
         return found
 
     @ti.func
-    def way_in(self, plug):
+    def inward_normal(self, plug):
         """Unit vector into the vessel."""
         n = ti.Vector([0.0, 0.0, 0.0])
         for k in ti.static(range(self.count)):
@@ -95,7 +95,7 @@ class Gates:
 
 
 @dataclass(eq=False)
-class Piston:
+class DrivenOpening:
     """What drives one opening."""
 
     opening: Opening
@@ -140,7 +140,7 @@ class Piston:
             self.asked, self.level, self.speed, self.way, self.pushed, self.taken.tolist()
         ]  # fmt: skip
 
-    def go_on_from(self, state: list[Any]) -> None:
+    def load_state(self, state: list[Any]) -> None:
         """Go on from what `state` gave."""
         self.asked, self.level, self.speed, self.way, self.pushed = state[:5]
         self.taken = np.array(state[5], np.int64)
@@ -157,7 +157,7 @@ class Piston:
         return math.sqrt(self.cross_section(spacing) * self.opening.area)
 
 
-def plug_sites(rim: Floats, opening: Opening, spacing: float) -> Floats:
+def buffer_sites(rim: Floats, opening: Opening, spacing: float) -> Floats:
     """Where columns cross an opening's plane: a square lattice half a spacing from the rim, (n, 3).
 
     Args:
@@ -192,7 +192,7 @@ def rim_distance(points: Floats, polygon: Floats) -> Floats:
     return np.asarray(np.linalg.norm(foot, axis=2).min(axis=1))
 
 
-def sleeve(
+def flow_extension(
     rim: Floats, opening: Opening, spacing: float, setback: float, depth: float
 ) -> tuple[Floats, Floats]:
     """Proxies of the sleeve behind an opening, and their normals, (n, 3) each.
@@ -224,16 +224,16 @@ def sleeve(
     return np.concatenate(points), np.concatenate(normals)
 
 
-def plug_layers(spacing: float, support_radius: float) -> int:
+def buffer_layers(spacing: float, support_radius: float) -> int:
     """Layers of a plug: blood at the plane must not feel its far end."""
     return math.ceil(support_radius / spacing) + 2
 
 
-class Pistons:
+class BufferZones:
     """All that drives blood through openings; there may be none."""
 
     def __init__(
-        self, pistons: list[Piston], spacing: float, support_radius: float, density: float
+        self, pistons: list[DrivenOpening], spacing: float, support_radius: float, density: float
     ):
         """Make the fields; spacing [m], support radius [m] and rest density [kg/m^3] of blood.
 
@@ -248,8 +248,8 @@ class Pistons:
         self.each = pistons
         self.spacing = spacing
         self.density = density
-        self.layers = plug_layers(spacing, support_radius)
-        self.gates = Gates(
+        self.layers = buffer_layers(spacing, support_radius)
+        self.gates = BufferRegions(
             tuple(tuple(map(float, p.opening.centre)) for p in pistons),  # type: ignore[misc]
             tuple(tuple(map(float, p.opening.normal)) for p in pistons),  # type: ignore[misc]
             tuple(
@@ -270,7 +270,7 @@ class Pistons:
         alone.finalize()
         self.members = ti.field(int, count)
         """Particles of each plug."""
-        self._orders = np.zeros((count, 4), number())
+        self._orders = np.zeros((count, 4), float_dtype())
 
     @property
     def capacity(self) -> int:
@@ -280,7 +280,7 @@ class Pistons:
     @property
     def far_end(self) -> float:
         """Distance from the plane beyond which blood leaves a plug for good [m]."""
-        return (self.layers + SLACK) * self.spacing
+        return (self.layers + HYSTERESIS) * self.spacing
 
     def initial_blood(self, blood: Floats) -> Floats:
         """The plugs at the start (n, 3) [m], where they leave blood (m, 3) [m] its room."""
@@ -299,7 +299,7 @@ class Pistons:
         """Work out the speeds for a step of dt that begins at a time [s]."""
         orders = self._orders
         for k, piston in enumerate(self.each):
-            most = dt / RISE
+            most = dt / RAMP_TIME
             piston.level += min(most, max(-most, piston.asked - piston.level))
             factor = piston.level * piston.waveform(time + dt)
             area = piston.cross_section(self.spacing)
@@ -310,7 +310,7 @@ class Pistons:
                 head = piston.pressure * factor - 0.5 * self.density * max(0.0, piston.speed) ** 2
                 push = head * piston.bearing(self.spacing) / (self.density * self.spacing**3)
                 orders[k] = 1.0, push, float(-np.dot(gravity, piston.opening.normal)), piston.speed
-        drive_plugs(particles, self, orders, dt)
+        drive_buffers(particles, self, orders, dt)
         for piston, order in zip(self.each, orders, strict=False):
             piston.speed = float(order[3])
             piston.way += piston.speed * dt
@@ -321,7 +321,7 @@ class Pistons:
         positions, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for piston in self.each:
             moved = piston.way / self.spacing + piston.lead
-            piston.taken -= moved < piston.taken - SLACK
+            piston.taken -= moved < piston.taken - HYSTERESIS
             due = moved > piston.taken + 1
             if not due.any():
                 continue
@@ -333,7 +333,7 @@ class Pistons:
 
 
 @ti.kernel
-def drive_plugs(
+def drive_buffers(
     p: ti.template(), plugs: ti.template(), orders: ti.types.ndarray(ndim=2), dt: float
 ):
     """U = u_given, or u += dt (sum_i a_i . n/N - g . n + push/N), n the way in.
@@ -344,10 +344,10 @@ def drive_plugs(
         plugs.thrust[k] = ti.cast(0, ti.i64)
         plugs.members[k] = 0
     for i in range(p.count[None]):
-        k = plugs.gates.plug_of(p.position[i])
+        k = plugs.gates.buffer_at(p.position[i])
         if k >= 0:
-            a = p.acceleration[i].dot(plugs.gates.way_in(k))
-            ti.atomic_add(plugs.thrust[k], ti.cast(a * FINE, ti.i64))
+            a = p.acceleration[i].dot(plugs.gates.inward_normal(k))
+            ti.atomic_add(plugs.thrust[k], ti.cast(a * FIXED_POINT_SCALE, ti.i64))
             ti.atomic_add(plugs.members[k], 1)
     for k in range(orders.shape[0]):
         u = orders[k, 1]
@@ -355,7 +355,7 @@ def drive_plugs(
             u = orders[k, 3]
             if plugs.members[k] > 0:
                 n = ti.cast(plugs.members[k], float)
-                mean = ti.cast(plugs.thrust[k], float) / FINE / n
+                mean = ti.cast(plugs.thrust[k], float) / FIXED_POINT_SCALE / n
                 u += dt * (mean - orders[k, 2] + orders[k, 1] / n)
         orders[k, 3] = u
         plugs.speed[k] = u
@@ -376,7 +376,7 @@ def add_blood(
     The first gets the given identity, and so on.  Writes: all of the state's rows, crowded.
     """
     for i in range(p.count[None]):
-        if p.identity[i] >= 0 and gates.plug_of(p.position[i]) >= 0:
+        if p.identity[i] >= 0 and gates.buffer_at(p.position[i]) >= 0:
             for m in range(crowded.shape[0]):
                 apart2 = 0.0
                 for a in ti.static(range(3)):

@@ -8,9 +8,9 @@ import numpy as np
 import taichi as ti
 
 from taichi_sph.geometry.mesh import Floats
-from taichi_sph.runtime import number
+from taichi_sph.runtime import float_dtype
 
-LOST, SUCTION = 0, 1
+OUT_OF_BOX, SUCTION = 0, 1
 """First places of the account: particles that left the grid's box, and those sucked away; each
 exit's follows.  What has left by place s has the identity -2 - s."""
 
@@ -18,7 +18,7 @@ MOST_DROPS = 4096
 """Drops that are remembered of blood that has left through exits told to, the latest ones."""
 
 
-class Exits:
+class Outlets:
     """The planes, and how many particles have left by each."""
 
     def __init__(self, count: int):
@@ -33,7 +33,7 @@ class Exits:
         """Unit normals, out."""
         self.reach = ti.field(float, rows)
         """Blood farther than this from the line has not left by it [m]; 0 where shut."""
-        self.drips = ti.field(int, rows)
+        self.track_droplets = ti.field(int, rows)
         """Whether what leaves is remembered as drops."""
         self.used = ti.field(int, ())
         """No exit from this one on has ever been open."""
@@ -44,11 +44,17 @@ class Exits:
         self.drop_time = ti.field(float, MOST_DROPS)
 
     def open(
-        self, k: int, begin: Floats, end: Floats, normal: Floats, reach: float, drips: bool = False
+        self,
+        k: int,
+        begin: Floats,
+        end: Floats,
+        normal: Floats,
+        reach: float,
+        track_droplets: bool = False,
     ) -> None:
         """Let blood leave by exit k; the meaning of the rest is that of the fields."""
         self.begin[k], self.end[k], self.normal[k] = begin, end, normal
-        self.reach[k], self.drips[k] = reach, int(drips)
+        self.reach[k], self.track_droplets[k] = reach, int(track_droplets)
         self.used[None] = max(self.used[None], k + 1)
 
     def shut(self, k: int) -> None:
@@ -77,12 +83,12 @@ class Exits:
         """
         n = min(int(self.drop_count[None]), MOST_DROPS)
         if n == 0:
-            return np.zeros((0, 3), number())
+            return np.zeros((0, 3), float_dtype())
         age = time - self.drop_time.to_numpy()[:n]
         recent = (age >= 0.0) & (age < longest)
         age = age[recent, None]
         x, v = (f.to_numpy()[:n][recent] for f in (self.drop_position, self.drop_velocity))
-        return np.asarray(x + v * age + 0.5 * np.asarray(gravity) * age**2, number())
+        return np.asarray(x + v * age + 0.5 * np.asarray(gravity) * age**2, float_dtype())
 
 
 @ti.kernel
@@ -98,7 +104,7 @@ def mark_removed(p: ti.template(), grid: ti.template(), exits: ti.template(), ti
                 if r.dot(exits.normal[k]) > 0.0 and (r - share * line).norm() < exits.reach[k]:
                     p.identity[i] = -4 - k
                     ti.atomic_add(exits.removed[2 + k], 1)
-                    if exits.drips[k] == 1:
+                    if exits.track_droplets[k] == 1:
                         m = ti.atomic_add(exits.drop_count[None], 1) % MOST_DROPS
                         exits.drop_position[m] = x
                         exits.drop_velocity[m] = p.velocity[i]
@@ -108,8 +114,8 @@ def mark_removed(p: ti.template(), grid: ti.template(), exits: ti.template(), ti
                 upper = grid.lower[a] + grid.cell[a] * grid.shape[a]
                 outside = x[a] < grid.lower[a] or x[a] > upper
                 if outside and p.identity[i] >= 0:
-                    p.identity[i] = -2 - LOST
-                    ti.atomic_add(exits.removed[LOST], 1)
+                    p.identity[i] = -2 - OUT_OF_BOX
+                    ti.atomic_add(exits.removed[OUT_OF_BOX], 1)
 
 
 @ti.kernel

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from taichi_sph.boundary.outlets import Exits, suck
+from taichi_sph.boundary.outlets import Outlets, suck
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Booleans, Floats, plane_axes
@@ -82,7 +82,7 @@ class Surgery:
     """Wounds, tool and suction of one simulation."""
 
     def __init__(
-        self, vessel: Vessel, wall: Wall, neighbors: Neighbors, exits: Exits, first_exit: int,
+        self, vessel: Vessel, wall: Wall, neighbors: Neighbors, exits: Outlets, first_exit: int,
         kernel: WendlandC2, spacing: float, tool: Tool,
     ):  # fmt: skip
         """`first_exit` and the MOST_WOUNDS - 1 after it are the wounds'; `spacing` [m] of blood."""
@@ -182,7 +182,7 @@ class Surgery:
         lift = wound.lift * wound.normal
         self.exits.open(
             self.first_exit + number, wound.begin + lift, wound.end + lift, wound.normal,
-            wound.reach, drips=True,
+            wound.reach, track_droplets=True,
         )  # fmt: skip
         self._make_wall()
 
@@ -246,7 +246,7 @@ class Surgery:
         self.wall.given = left._replace(volume=volume, wide_volume=wide_volume)
         self.neighbors.sort_wall(self.wall)
 
-    def rehearse(self, particles: Particles) -> None:
+    def compile_kernels(self, particles: Particles) -> None:
         """Have the kernel of the suction compiled."""
         suck(particles, self.exits, 0.0, 0.0, 0.0, 0.0, 0)
 
@@ -309,7 +309,7 @@ class Surgery:
             ],
         }  # fmt: skip
 
-    def go_on_from(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave."""
         self.wounds = [
             Wound(

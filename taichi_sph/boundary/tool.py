@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import wall_sampling
-from taichi_sph.geometry.mesh import Booleans, Floats, Integers, Nearest, clean, is_closed
+from taichi_sph.geometry.mesh import Booleans, Floats, Integers, NearestPoint, clean, is_closed
 from taichi_sph.geometry.openings import load_surface, require_manifold, require_outward
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall, proxy_volumes
-from taichi_sph.runtime import number
+from taichi_sph.runtime import float_dtype
 from taichi_sph.scene import ToolTable
 
 FOLLOWING = 0.01
@@ -53,7 +53,7 @@ class Shape:
 
     def distance(self, points: Floats) -> Floats:
         """Distance of points (n, 3) [m], about the tool's origin, to its surface [m], (n,)."""
-        return Nearest(self.vertices, self.faces)(points)[0]
+        return NearestPoint(self.vertices, self.faces)(points)[0]
 
 
 def read_shape(
@@ -78,7 +78,7 @@ def read_shape(
     if not is_closed(faces):
         raise InputError(f"{path}: the tool's surface has holes; it must be closed")
     require_outward(vertices, faces, str(path))
-    points, nearest = wall_sampling.even_points(vertices, faces, spacing, seed=0)
+    points, nearest = wall_sampling.relaxed_points(vertices, faces, spacing, seed=0)
     outward = wall_sampling.normals_at(vertices, faces, points, nearest)
     position = points - setback * outward
     shape = Shape(
@@ -178,8 +178,8 @@ class Tool:
             self.velocity + np.cross(self.spin, arm),
         )
         place_tool(
-            wall, neighbors, *(np.ascontiguousarray(a, number()) for a in rows),
-            self.shape.volume.astype(number()), *map(float, self.position), self.shape.radius,
+            wall, neighbors, *(np.ascontiguousarray(a, float_dtype()) for a in rows),
+            self.shape.volume.astype(float_dtype()), *map(float, self.position), self.shape.radius,
         )  # fmt: skip
 
 

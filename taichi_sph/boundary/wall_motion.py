@@ -1,8 +1,8 @@
 """Pulse: the vessel's wall moves out along its normals and back, as an artery's does.
 
 The motion is prescribed: blood feels it and does not act on it.  The level, 0 narrow to 1 wide, is
-a waveform brought to that range; it rises from 0, the surface of the file, within `RISE`.  The wall
-is held at the vessel's openings.
+a waveform brought to that range; it rises from 0, the surface of the file, within `RAMP_TIME`.  The
+wall is held at the vessel's openings.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_sph.boundary.inflow import RISE
+from taichi_sph.boundary.inflow import RAMP_TIME
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.geometry.vessel import Vessel
@@ -26,7 +26,7 @@ LARGEST = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Pulse:
+class WallMotion:
     """How far and when the wall moves."""
 
     swing: float
@@ -40,7 +40,7 @@ class Pulse:
     def level(self, time: float) -> float:
         """0 narrow to 1 wide, at a time [s]."""
         low, high = self._range
-        risen = min(1.0, max(0.0, time / RISE))
+        risen = min(1.0, max(0.0, time / RAMP_TIME))
         return risen * (self.waveform(time) - low) / (high - low)
 
     def rate(self, time: float) -> float:
@@ -50,7 +50,7 @@ class Pulse:
     @property
     def fastest(self) -> float:
         """The highest rate, out or in [1/s]."""
-        until = RISE + float(self.waveform.time[-1])
+        until = RAMP_TIME + float(self.waveform.time[-1])
         return max(abs(self.rate(LAG * k)) for k in range(round(until / LAG) + 2))
 
     def reach(self, vessel: Vessel, points: Floats) -> Floats:
@@ -69,7 +69,7 @@ class Pulse:
         return reach
 
 
-def read_pulse(scene: Scene, vessel: Vessel) -> Pulse | None:
+def read_wall_motion(scene: Scene, vessel: Vessel) -> WallMotion | None:
     """The pulse of a scene; None where its wall stands still.
 
     Raises:
@@ -89,4 +89,4 @@ def read_pulse(scene: Scene, vessel: Vessel) -> Pulse | None:
             f"wall.pulse: {scene.wall.pulse:g} m is too far for the narrowest place of "
             f"{vessel.label} ({vessel.narrowest:.3g} m across); allowed: at most {most:.3g} m"
         )
-    return Pulse(scene.wall.pulse, waveform)
+    return WallMotion(scene.wall.pulse, waveform)

@@ -56,7 +56,7 @@ class ImplicitAcceleration:
     """The physics' sums under a pressure that looks a step ahead."""
 
     name = "implicit"
-    fell_back = False
+    used_fallback = False
 
     def __init__(self, fluid: Fluid, capacity: int, interval: float, rounds: int = ROUNDS):
         """Make the scratch fields; `interval` is T [s], `rounds` the Jacobi rounds a step."""
@@ -68,7 +68,7 @@ class ImplicitAcceleration:
         """T^2 rho_0 D [kg s^2/m^5]."""
 
     @property
-    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field]:
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field]:
         """Constants, p/rho^2 and mu."""
         return self.fluid, self.physics.pressure_term, self.physics.viscosity
 
@@ -99,13 +99,13 @@ class ImplicitAcceleration:
         return step_within_reach(self.interval, self.fluid.kernel.support_radius, largest_speed)
 
 
-def implicit_for(
+def implicit_factory(
     scene: Scene, advance: float = ADVANCE, rounds: int = ROUNDS
 ) -> Callable[[Fluid, int], ImplicitAcceleration]:
     """A maker of implicit models for `Simulation`, whose step suits a scene's largest speed."""
 
     def make(fluid: Fluid, capacity: int) -> ImplicitAcceleration:
-        speed = fluid.state.sound_speed / scene.discretization.sound_speed_ratio
+        speed = fluid.equation_of_state.sound_speed / scene.discretization.sound_speed_ratio
         interval = advance * fluid.kernel.support_radius / speed
         return ImplicitAcceleration(fluid, capacity, interval, rounds)
 
@@ -127,8 +127,8 @@ def guess_pressure(
 
     Reads: position, velocity.  Writes: density, pressure_term, viscosity, response.
     """
-    rest_density = ti.static(fluid.state.rest_density)
-    share = ti.static(fluid.calibration.mass / fluid.state.rest_density)
+    rest_density = ti.static(fluid.equation_of_state.rest_density)
+    share = ti.static(fluid.calibration.mass / fluid.equation_of_state.rest_density)
     gamma = ti.static(fluid.calibration.wall_density)
     radius = ti.static(fluid.kernel.support_radius)
     thickest = ti.static(LARGEST_VISCOSITY) * rest_density * radius * radius / interval
@@ -197,8 +197,8 @@ def correct_pressure(
 
     Reads: position, velocity, acceleration, density.  Writes: pressure_term.
     """
-    rest_density = ti.static(fluid.state.rest_density)
-    share = ti.static(fluid.calibration.mass / fluid.state.rest_density)
+    rest_density = ti.static(fluid.equation_of_state.rest_density)
+    share = ti.static(fluid.calibration.mass / fluid.equation_of_state.rest_density)
     gamma = ti.static(fluid.calibration.wall_density)
     for i in range(p.count[None]):
         x_i = p.position[i]

@@ -76,7 +76,7 @@ class Casson:
 Rheology = Newtonian | Casson
 
 
-def rheology_of(table: NewtonianTable | CassonTable) -> Rheology:
+def make_rheology(table: NewtonianTable | CassonTable) -> Rheology:
     """The viscosity law that a scene asks for."""
     if isinstance(table, NewtonianTable):
         return Newtonian(table.viscosity)

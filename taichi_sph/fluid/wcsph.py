@@ -28,12 +28,12 @@ class AccelerationModel(Protocol):
     """Short name for summaries."""
 
     @property
-    def fell_back(self) -> bool:
+    def used_fallback(self) -> bool:
         """Whether the last acceleration is the physics', since the model did not trust itself."""
         ...
 
     @property
-    def pairwise(self) -> "tuple[Fluid, ti.Field, ti.Field] | None":
+    def pair_coefficients(self) -> "tuple[Fluid, ti.Field, ti.Field] | None":
         """What the last forces were summed from: constants, p/rho^2 and mu; None if from none."""
         ...
 
@@ -62,7 +62,7 @@ class Fluid:
     """Everything that is constant in the sums."""
 
     kernel: WendlandC2
-    state: Tait
+    equation_of_state: Tait
     rheology: Rheology
     calibration: Calibration
     artificial_viscosity: float
@@ -80,14 +80,18 @@ class Fluid:
     @property
     def signal(self) -> float:
         """Alpha h_s c [m^2/s] of the artificial viscosity."""
-        return self.artificial_viscosity * self.kernel.smoothing_length * self.state.sound_speed
+        return (
+            self.artificial_viscosity
+            * self.kernel.smoothing_length
+            * self.equation_of_state.sound_speed
+        )
 
 
 class SphAcceleration:
     """Weakly compressible SPH with Casson blood and wall coupling."""
 
     name = "physics"
-    fell_back = False
+    used_fallback = False
 
     def __init__(self, fluid: Fluid, capacity: int):
         """Make the scratch fields for `capacity` particles."""
@@ -100,7 +104,7 @@ class SphAcceleration:
         """tau [Pa], in the nested form only."""
 
     @property
-    def pairwise(self) -> tuple[Fluid, ti.Field, ti.Field]:
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field]:
         """Constants, p/rho^2 and mu."""
         return self.fluid, self.pressure_term, self.viscosity
 
@@ -133,7 +137,7 @@ class SphAcceleration:
         et al. 1997, doi:10.1006/jcph.1997.5776, section 3.5.
         """
         h = self.fluid.kernel.smoothing_length
-        state = self.fluid.state
+        state = self.fluid.equation_of_state
         step = self.fluid.courant_number * h / (state.sound_speed + largest_speed)
         step = min(step, 0.125 * h * h * state.rest_density / self.fluid.rheology.largest_viscosity)
         if largest_acceleration > 0.0:
@@ -160,7 +164,7 @@ def sum_density(
     with the rest volume V = m/rho_0 for m/rho_j: equal to within the compression, and known in
     the same pass.  Reads: position, velocity.  Writes: density, pressure_term, viscosity.
     """
-    rest_density = ti.static(fluid.state.rest_density)
+    rest_density = ti.static(fluid.equation_of_state.rest_density)
     mass = ti.static(fluid.calibration.mass)
     for i in range(p.count[None]):
         x_i = p.position[i]
@@ -189,7 +193,7 @@ def sum_density(
                 )
         rho = mass * blood + ti.static(fluid.calibration.wall_density * rest_density) * behind
         p.density[i] = rho
-        pressure_term[i] = fluid.state.pressure(rho) / (rho * rho)
+        pressure_term[i] = fluid.equation_of_state.pressure(rho) / (rho * rho)
         viscosity[i] = fluid.rheology.viscosity(shear_rate(gradient))
 
 
@@ -224,10 +228,10 @@ def force_on_tool(
             k = nb.wall_index[i, n]
             if k >= w.count:
                 r_ik = nb.grid.separation(p.position[i], w.position[k])
-                force -= from_proxy(
+                force -= wall_pair_acceleration(
                     w, k, r_ik, p.velocity[i], p.density[i], pressure_term[i], viscosity[i], fluid
                 )
-    return ti.static(p.mass * fluid.state.rest_density) * force
+    return ti.static(p.mass * fluid.equation_of_state.rest_density) * force
 
 
 @ti.kernel
@@ -268,7 +272,7 @@ def sum_stress(
 
 
 @ti.func
-def from_proxy(w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, fluid: ti.template()):
+def wall_pair_acceleration(w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, fluid: ti.template()):
     """a_ik/rho_0 [m^4/(kg s^2)]: see `sum_acceleration`."""
     eps = ti.static(fluid.softening)
     r2 = r_ik.norm_sqr()
@@ -345,7 +349,7 @@ def sum_acceleration(
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
-            wall += from_proxy(w, k, r_ik, v_i, rho_i, p_i, mu_i, fluid)
-        wall *= ti.static(fluid.state.rest_density)
+            wall += wall_pair_acceleration(w, k, r_ik, v_i, rho_i, p_i, mu_i, fluid)
+        wall *= ti.static(fluid.equation_of_state.rest_density)
         # A vector as an argument would cost 0.05 ms a launch.
         p.acceleration[i] = a_i + wall + ti.Vector([g_x, g_y, g_z])

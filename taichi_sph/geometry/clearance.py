@@ -11,12 +11,12 @@ from taichi_sph.geometry.mesh import (
     Booleans,
     Floats,
     Integers,
-    Nearest,
+    NearestPoint,
     face_vectors,
     plane_axes,
     unit,
 )
-from taichi_sph.geometry.wall_sampling import scatter
+from taichi_sph.geometry.wall_sampling import stratified_points
 
 End = tuple[Floats, Floats, float]
 """Centre, outward unit normal and radius of an opening."""
@@ -41,7 +41,7 @@ def narrowest_radius(
         ends: The openings.
         contains: Which points (k, 3) lie within the lumen.
     """
-    nearest_on = Nearest(vertices, wall)
+    nearest_on = NearestPoint(vertices, wall)
 
     def clearance(points: Floats) -> Floats:
         return nearest_on(points)[0]
@@ -54,7 +54,7 @@ def narrowest_radius(
         size = max(size, float(np.prod(high - low) / 2e6) ** (1 / 3))
         shape = np.ceil((high - low) / size).astype(int)
         corner = 0.5 * (low + high) - 0.5 * size * shape
-        skin = scatter(vertices, faces, int(6 * area / size**2) + 1, seed=0)
+        skin = stratified_points(vertices, faces, int(6 * area / size**2) + 1, seed=0)
         inside = _inside_cells(skin, contains, corner, shape, size)
         places = corner + (np.argwhere(inside) + 0.5) * size
         if len(places) == 0:

@@ -89,7 +89,7 @@ def face_pairs(faces: Integers) -> tuple[Integers, Integers]:
     return np.stack([first, second], axis=1), edges[shared]
 
 
-def is_oriented(faces: Integers) -> bool:
+def is_winding_consistent(faces: Integers) -> bool:
     """Whether neighbouring triangles all turn the same way."""
     edges = directed_edges(faces)
     size = int(faces.max()) + 1
@@ -101,7 +101,7 @@ def is_closed(faces: Integers) -> bool:
     return bool((edge_uses(faces)[2] == 2).all())
 
 
-def pieces(faces: Integers, count: int) -> tuple[int, Integers]:
+def components(faces: Integers, count: int) -> tuple[int, Integers]:
     """Number of connected pieces and the piece of every triangle."""
     edges = directed_edges(faces)
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
@@ -268,7 +268,7 @@ def _check_fill(
     single = {tuple(edge) for edge in edges[uses == 1].tolist()}
     whole = abs(0.5 * np.abs(double).sum() - area) < 1e-6 * area
     del inverse
-    return kept if whole and single == rim and is_oriented(kept) else None
+    return kept if whole and single == rim and is_winding_consistent(kept) else None
 
 
 def flat_regions(vertices: Floats, faces: Integers) -> list[Integers]:
@@ -378,7 +378,7 @@ def _mark_crossings(
         bad[q[free][pierced]] = True
 
 
-class Nearest:
+class NearestPoint:
     """Nearest places on a mesh; the tree over its triangles is built once."""
 
     def __init__(self, vertices: Floats, faces: Integers):

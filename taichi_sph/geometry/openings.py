@@ -106,7 +106,7 @@ def require_manifold(vertices: Floats, faces: Integers, label: str) -> None:
             f"{label}: {int((uses > 2).sum())} edges have more than two triangles (first at "
             f"{where(vertices[first].mean(axis=0))}); a surface needs one or two at every edge"
         )
-    count, piece = mesh.pieces(faces, len(vertices))
+    count, piece = mesh.components(faces, len(vertices))
     if count > 1:
         sizes = ", ".join(str(n) for n in np.sort(np.bincount(piece))[::-1][:5])
         raise InputError(
@@ -120,7 +120,7 @@ def require_manifold(vertices: Floats, faces: Integers, label: str) -> None:
             f"{label}: parts of the surface touch at a single vertex (first at {place}); "
             "separate or merge them"
         )
-    if not mesh.is_oriented(faces):
+    if not mesh.is_winding_consistent(faces):
         raise InputError(
             f"{label}: neighbouring triangles turn different ways, so inside and outside are not "
             "defined; make the normals consistent and outward"

@@ -74,8 +74,8 @@ class Vessel:
         return tree
 
     @cached_property
-    def _nearest(self) -> mesh.Nearest:
-        return mesh.Nearest(self.vertices, self._triangles)
+    def _nearest(self) -> mesh.NearestPoint:
+        return mesh.NearestPoint(self.vertices, self._triangles)
 
     @cached_property
     def _interior(self) -> Interior:
@@ -187,8 +187,8 @@ class Vessel:
         stored = wall_sampling.load_cached(key)
         if stored is not None:
             return stored
-        points, nearest = wall_sampling.even_points(self.vertices, faces, spacing, seed)
-        figures = wall_sampling.evenness(points, self.vertices, faces, spacing)
+        points, nearest = wall_sampling.relaxed_points(self.vertices, faces, spacing, seed)
+        figures = wall_sampling.spacing_statistics(points, self.vertices, faces, spacing)
         normals = wall_sampling.normals_at(self.vertices, faces, points, nearest)
         positions = points + setback * normals
         for opening in self.openings:

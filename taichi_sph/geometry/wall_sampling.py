@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from taichi_sph.geometry.mesh import (
     Floats,
     Integers,
-    Nearest,
+    NearestPoint,
     corner_normals,
     face_vectors,
 )
@@ -59,7 +59,7 @@ def _spread_bits(x: Integers) -> Integers:
     return (x | (x << 2)) & 0x09249249
 
 
-def scatter(vertices: Floats, faces: Integers, count: int, seed: int) -> Floats:
+def stratified_points(vertices: Floats, faces: Integers, count: int, seed: int) -> Floats:
     """Random points (count, 3), one in each of `count` compact patches of equal area."""
     corners = vertices[faces]
     area = np.linalg.norm(face_vectors(vertices, faces), axis=1)
@@ -85,15 +85,15 @@ def scatter(vertices: Floats, faces: Integers, count: int, seed: int) -> Floats:
     return triangle[:, 0] * (1 - u) + triangle[:, 1] * u * (1 - v) + triangle[:, 2] * u * v
 
 
-def even_points(
+def relaxed_points(
     vertices: Floats, faces: Integers, spacing: float, seed: int
 ) -> tuple[Floats, Integers]:
     """Points (k, 3) spread evenly on a mesh, area / spacing^2 of them, and their triangles (k,)."""
     area = float(np.linalg.norm(face_vectors(vertices, faces), axis=1).sum())
     count = max(1, round(area / spacing**2))
-    points = scatter(vertices, faces, count, seed)
+    points = stratified_points(vertices, faces, count, seed)
     reach = _REACH * spacing
-    nearest_on = Nearest(vertices, faces)
+    nearest_on = NearestPoint(vertices, faces)
     nearest = np.zeros(count, np.int64)
     for _ in range(_ROUNDS):
         i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
@@ -132,7 +132,7 @@ def normals_at(vertices: Floats, faces: Integers, points: Floats, nearest: Integ
     )
 
 
-def evenness(
+def spacing_statistics(
     points: Floats, vertices: Floats, faces: Integers, spacing: float
 ) -> tuple[float, float, float, float]:
     """Mean, relative spread and least of nearest distances, and the largest gap, over spacing."""
@@ -140,7 +140,7 @@ def evenness(
     if len(points) < 2:
         return 0.0, 0.0, 0.0, float("inf")
     nearest = tree.query(points, k=2, workers=-1)[0][:, 1] / spacing
-    probes = scatter(vertices, faces, 4 * len(points), seed=1)
+    probes = stratified_points(vertices, faces, 4 * len(points), seed=1)
     gap = float(tree.query(probes, workers=-1)[0].max()) / spacing
     mean = float(nearest.mean())
     return mean, float(nearest.std()) / mean, float(nearest.min()), gap

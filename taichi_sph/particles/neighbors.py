@@ -16,7 +16,7 @@ import taichi as ti
 from taichi_sph.errors import RunError
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall
-from taichi_sph.runtime import number
+from taichi_sph.runtime import float_dtype
 
 ROW_MULTIPLE = 8
 
@@ -258,8 +258,8 @@ class Neighbors:
         proxies.cell_start.fill(0)
         if wall.count == 0:
             return
-        given = [np.asarray(a, dtype=number()) for a in wall.given]
-        x = np.asarray(wall.given.at(0.5), dtype=number())
+        given = [np.asarray(a, dtype=float_dtype()) for a in wall.given]
+        x = np.asarray(wall.given.at(0.5), dtype=float_dtype())
         c = np.floor((x - np.asarray(self.grid.lower)) / np.asarray(self.grid.cell)).astype(int)
         c = np.clip(c, 0, np.asarray(self.grid.shape) - 1)
         cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from taichi_sph.errors import RunError
-from taichi_sph.runtime import number
+from taichi_sph.runtime import float_dtype
 
 
 @dataclass(eq=False)
@@ -65,7 +65,9 @@ class Particles:
             raise RunError("initial positions and velocities must be finite numbers")
         particles = cls.allocate(n + room, mass)
         # One kernel for all: each field's own would cost some 0.05 s at start.
-        place_rows(particles, *(np.ascontiguousarray(a, number()) for a in (position, velocity)))
+        place_rows(
+            particles, *(np.ascontiguousarray(a, float_dtype()) for a in (position, velocity))
+        )
         return particles
 
     def replace(self, **rows: np.ndarray) -> None:
@@ -87,7 +89,7 @@ class Particles:
         """Copies of identities (n,), positions [m] and velocities [m/s], (n, 3), as `copy_to`."""
         n = int(self.count[None])
         identity = np.empty(n, np.int32)
-        position, velocity = (np.empty((n, 3), number()) for _ in range(2))
+        position, velocity = (np.empty((n, 3), float_dtype()) for _ in range(2))
         self.copy_to(identity, position, velocity)
         return identity, position, velocity
 

@@ -56,7 +56,7 @@ def precision() -> str:
     return "f64" if ti.lang.impl.get_runtime().default_fp == ti.f64 else "f32"
 
 
-def number() -> np.dtype:
+def float_dtype() -> np.dtype:
     """The numpy type of this session's precision."""
     return np.dtype("f8" if precision() == "f64" else "f4")
 
@@ -80,7 +80,7 @@ def make_fluid(
 
 
 @cache
-def model_of(fluid: Fluid) -> SphAcceleration:
+def make_model(fluid: Fluid) -> SphAcceleration:
     """One model for equal fluids: its scratch is compiled into the kernels."""
     return SphAcceleration(fluid, CAPACITY)
 
@@ -92,13 +92,13 @@ class Prescribed:
     law: Callable[[np.ndarray], np.ndarray]
     step: float
     name: str = "prescribed"
-    fell_back: bool = False
-    pairwise: None = None
+    used_fallback: bool = False
+    pair_coefficients: None = None
 
     def accelerate(self, particles, wall, neighbors, gravity) -> None:
         """Write the law's acceleration and the rest density."""
         live = particles.count[None]
-        acceleration = np.zeros((CAPACITY, 3), number())
+        acceleration = np.zeros((CAPACITY, 3), float_dtype())
         acceleration[:live] = self.law(particles.position.to_numpy()[:live].astype(float))
         particles.acceleration.from_numpy(acceleration)
         particles.density.fill(DENSITY)
@@ -109,7 +109,7 @@ class Prescribed:
 
 
 @dataclass
-class Stage:
+class Setup:
     """Particles, a wall and lists, with the wall's own arrays to put it back."""
 
     particles: Particles
@@ -131,7 +131,7 @@ class Stage:
     ) -> None:
         """Replace the blood; row k gets identity k unless told otherwise."""
         n = len(position)
-        rows = np.zeros((3, CAPACITY, 3), number())
+        rows = np.zeros((3, CAPACITY, 3), float_dtype())
         rows[0, :n] = position
         rows[1, :n] = 0.0 if velocity is None else velocity
         names = np.full(CAPACITY, -1, np.int32)
@@ -155,7 +155,7 @@ class Stage:
     def accelerate(self, fluid: Fluid, gravity=(0.0, 0.0, 0.0)) -> np.ndarray:
         """Build the lists and return the accelerations in order of identity [m/s^2]."""
         self.build()
-        model_of(fluid).accelerate(self.particles, self.wall, self.neighbors, gravity)
+        make_model(fluid).accelerate(self.particles, self.wall, self.neighbors, gravity)
         return self.in_order(self.particles.acceleration)
 
     def in_order(self, field: ti.Field) -> np.ndarray:
@@ -178,8 +178,8 @@ class Stage:
             spacing=D,
             support=R,
             rest_density=DENSITY,
-            sound_speed=fluid.state.sound_speed,
-            background=fluid.state.background_pressure,
+            sound_speed=fluid.equation_of_state.sound_speed,
+            background=fluid.equation_of_state.background_pressure,
             alpha=fluid.artificial_viscosity,
             eta=rheology.eta,
             tau_y=getattr(rheology, "tau_y", 0.0),
@@ -194,7 +194,7 @@ def _particles() -> Particles:
     return Particles.allocate(CAPACITY, calibration().mass)
 
 
-def _stage(lower, upper, period, reach, position, normal) -> Stage:
+def _stage(lower, upper, period, reach, position, normal) -> Setup:
     """A stage on the shared particles."""
     wall = Wall.from_numpy(position, normal, KERNEL, calibration().setback, WALL_SPACING, period)
     neighbors = Neighbors.allocate(
@@ -202,11 +202,11 @@ def _stage(lower, upper, period, reach, position, normal) -> Stage:
         R, SKIN, CAPACITY, D, wall,
     )  # fmt: skip
     neighbors.sort_wall(wall)
-    return Stage(_particles(), wall, neighbors, position, normal)
+    return Setup(_particles(), wall, neighbors, position, normal)
 
 
 @cache
-def periodic() -> Stage:
+def periodic() -> Setup:
     """A cube that repeats along every axis, no wall, cells as wide as the lists reach."""
     return _stage(
         (0, 0, 0), (BOX, BOX, BOX), (BOX, BOX, BOX), (1, 1, 1), np.zeros((0, 3)), np.zeros((0, 3))
@@ -214,7 +214,7 @@ def periodic() -> Stage:
 
 
 @cache
-def plane() -> Stage:
+def plane() -> Setup:
     """A plane wall at z = 0 with blood above it, and a septum far above; x and y repeat."""
     axis = np.arange(9) * WALL_SPACING
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
@@ -230,7 +230,7 @@ def plane() -> Stage:
 
 
 @cache
-def sphere() -> Stage:
+def sphere() -> Setup:
     """A round vessel about the origin, in a box without periods."""
     radius = SPHERE + calibration().setback
     m = round(4 * np.pi * radius**2 / WALL_SPACING**2)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from nn import dataset
-from nn.dataset import Dataset, Facts, Proxies, RunWriter, State, Substeps, check
+from nn.dataset import Dataset, Proxies, RecordedState, RunMetadata, RunWriter, Substeps, check
 from taichi_sph.errors import InputError
 
 SCENE = """
@@ -25,7 +25,7 @@ vessel = { surface = "lumen.ply" }
 column = { opening = "top", particles = 9 }
 discretization = { spacing = 0.001 }
 """
-FACTS = Facts(
+FACTS = RunMetadata(
     scene=SCENE,
     scene_name="tank",
     scene_folder="/vessels/tank",
@@ -52,7 +52,7 @@ WALL = Proxies(
 FEATURES = 23
 
 
-def states(facts: Facts) -> list[State]:
+def states(facts: RunMetadata) -> list[RecordedState]:
     """Blood of which ten particles leave after every second frame."""
     random = np.random.default_rng(facts.seed)
     alive = np.ones(facts.particles, bool)
@@ -62,11 +62,11 @@ def states(facts: Facts) -> list[State]:
             alive[np.flatnonzero(alive)[:10]] = False
         position, velocity = random.normal(size=(2, facts.particles, 3)).astype(np.float32)
         position[~alive] = velocity[~alive] = 0.0
-        made.append(State(position, velocity, alive.copy()))
+        made.append(RecordedState(position, velocity, alive.copy()))
     return made
 
 
-def write(writer: RunWriter, made: list[State], width: int, upto: int) -> None:
+def write(writer: RunWriter, made: list[RecordedState], width: int, upto: int) -> None:
     """Append states from where the writer is up to a number of them."""
     interval = writer.facts.frame_interval
     for frame in range(writer.committed, upto):
@@ -82,7 +82,9 @@ def write(writer: RunWriter, made: list[State], width: int, upto: int) -> None:
         writer.append(state, acceleration, features, Substeps(4 + frame % 2, 4e-5, 5e-5))
 
 
-def make(path: Path, facts: tuple[Facts, ...] = (FACTS,), width: int = 0) -> list[list[State]]:
+def make(
+    path: Path, facts: tuple[RunMetadata, ...] = (FACTS,), width: int = 0
+) -> list[list[RecordedState]]:
     """A dataset of made-up runs."""
     parts, everything = [], []
     for number, one in enumerate(facts):
@@ -184,7 +186,7 @@ def test_every_dataset_has_a_unit_and_frames_are_chunks_with_checksums(path: Pat
 def test_a_run_with_no_sub_step_at_all_can_be_kept(path: Path) -> None:
     facts = replace(FACTS, frames=1, particles=3)
     with RunWriter(path.with_name("part"), facts, WALL) as writer:
-        gone = State(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3, bool))
+        gone = RecordedState(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3, bool))
         for _ in range(2):
             writer.append(gone, np.zeros((3, 3)), None, Substeps())
     dataset.merge([path.with_name("part")], path)
@@ -389,10 +391,10 @@ STREAM = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from test_dataset import FACTS, WALL, dataset, replace, RunWriter, State, Substeps
+from test_dataset import FACTS, WALL, dataset, replace, RunWriter, RecordedState, Substeps
 facts = replace(FACTS, frames=60, particles=20000)
 part, out = Path("part"), Path("data.h5")
-state = State(*np.zeros((2, 20000, 3), np.float32), np.ones(20000, bool))
+state = RecordedState(*np.zeros((2, 20000, 3), np.float32), np.ones(20000, bool))
 def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 def stream(path, frames, out):

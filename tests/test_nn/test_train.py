@@ -15,14 +15,14 @@ from builders import vesselflow  # noqa: E402
 from nn.dataset import Dataset  # noqa: E402
 from nn.features import COUNT, FeatureScales  # noqa: E402
 from nn.pcnet import DirectPcNet, make_pcnet  # noqa: E402
-from nn.training.rollout import Stage  # noqa: E402
+from nn.training.rollout import ReplaySimulation  # noqa: E402
 from nn.training.train import (  # noqa: E402
     INPUTS,
-    Course,
     Model,
     Progress,
-    Sample,
     Settings,
+    TrainingRuns,
+    TrainingSample,
     train_weights,
 )
 from nn.weights import Training, Weights  # noqa: E402
@@ -34,13 +34,13 @@ CLOSE = {"f64": 2e-6, "f32": 2e-5}
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
+def stage() -> ReplaySimulation:
     """A small column in the straight tube, a while after it has let go."""
     scene = find_scene("tube")
     grid = msgspec.structs.replace(scene.discretization, spacing=1.25e-3)
     column = msgspec.structs.replace(scene.column, height=0.015, particles=None)
     scene = msgspec.structs.replace(scene, discretization=grid, column=column)
-    stage = Stage(scene, read_vessel(scene), 0)
+    stage = ReplaySimulation(scene, read_vessel(scene), 0)
     stage.advance_to(0.01)
     # Stirred, so that every term of the sums matters.
     state = stage.state()
@@ -58,10 +58,10 @@ def stage() -> Stage:
 
 
 @pytest.fixture(scope="module")
-def course(box: Path) -> Iterator[Course]:
+def course(box: Path) -> Iterator[TrainingRuns]:
     """One for all trainings: each new one compiles everything again."""
     with Dataset(box / "data.h5") as file:
-        yield Course(file, [0])
+        yield TrainingRuns(file, [0])
 
 
 @pytest.mark.parametrize(("head", "rounds"), [("direct", 0), ("pressure", 0), ("pressure", 2)])
@@ -76,11 +76,13 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     features = stage.features(scales)[:, training.columns.index]
     model = Model(training, features.mean(axis=0), np.maximum(features.std(axis=0), 1e-2), 0.7)
     n = stage.particles.count[None]
-    sample = Sample(stage, scales, np.zeros((n, 3)), np.ones(n, bool), pairs=head == "pressure")
+    sample = TrainingSample(
+        stage, scales, np.zeros((n, 3)), np.ones(n, bool), pairs=head == "pressure"
+    )
     with torch.no_grad():
         fluid = stage.fluid
         down = torch.tensor((0.0, 0.0 if head == "direct" else -9.81, 0.0))
-        density, eta = fluid.state.rest_density, fluid.rheology.eta
+        density, eta = fluid.equation_of_state.rest_density, fluid.rheology.eta
         expected = model.step(sample, density, eta, down).acceleration.numpy()
     net = make_pcnet(model.weights(), stage.fluid, scales, stage.particles.capacity)
     if isinstance(net, DirectPcNet):
@@ -92,7 +94,7 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     assert np.abs(found - expected).max() < CLOSE[precision] * scale
 
 
-def one_step_error(course: Course, weights: Weights) -> float:
+def one_step_error(course: TrainingRuns, weights: Weights) -> float:
     """Root mean square error of the acceleration over the held-out run [m/s^2]."""
     run, net, wrong = course.held[0], course.pcnet(weights), []
     particles = course.stage.particles
@@ -108,7 +110,7 @@ def one_step_error(course: Course, weights: Weights) -> float:
     return float(np.sqrt(np.concatenate(wrong).mean()))
 
 
-def test_training_learns_and_its_weights_run(box: Path, course: Course, tmp_path: Path):
+def test_training_learns_and_its_weights_run(box: Path, course: TrainingRuns, tmp_path: Path):
     data, out, picture = box / "data.h5", tmp_path / "w.npz", tmp_path / "w.png"
     vesselflow("train", data, "--out", out, "--iterations", "60", "--plot", picture)
     told = msgspec.json.decode(out.with_suffix(".history.json").read_bytes())

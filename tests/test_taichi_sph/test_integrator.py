@@ -7,15 +7,15 @@ from builders import (
     SPHERE,
     D,
     Prescribed,
-    Stage,
+    Setup,
     calibration,
-    number,
+    float_dtype,
     periodic,
     plane,
     precision,
     sphere,
 )
-from taichi_sph.integrator import NO_PLUGS, WALL_MARGIN, kick_drift, survey
+from taichi_sph.integrator import NO_PLUGS, WALL_MARGIN, kick_drift, largest_speed_and_acceleration
 from taichi_sph.motion import Motion
 
 MAP = {"f64": 1e-9, "f32": 1e-3}
@@ -46,7 +46,7 @@ def one_step_map(printed: bool, w: float) -> np.ndarray:
     v = np.array([[0.0] * 3, [OMEGA * small] * 3])
     stage.put(x, v)
     stage.build()
-    acceleration = np.zeros((CAPACITY, 3), number())
+    acceleration = np.zeros((CAPACITY, 3), float_dtype())
     acceleration[:2] = spring(stage.particles.position.to_numpy()[:2].astype(float))
     stage.particles.acceleration.from_numpy(acceleration)
     kick_drift(stage.particles, stage.wall, stage.neighbors, NO_PLUGS, printed, dt)
@@ -143,7 +143,7 @@ def test_blood_that_leaves_a_period_comes_in_again_on_the_other_side():
     assert np.sqrt(moved2) == pytest.approx(np.hypot(0.2, 0.2) * D, rel=1e-4)
 
 
-def shoot(stage: Stage, x, v, steps: int, per_step: float) -> Motion:
+def shoot(stage: Setup, x, v, steps: int, per_step: float) -> Motion:
     """Lone drops without any force, a distance a step; returns the motion at its end."""
     x, v = np.atleast_2d(x), np.atleast_2d(v)
     dt = per_step / np.linalg.norm(v, axis=1).max()
@@ -183,7 +183,7 @@ def test_drop_that_leaves_the_wall_is_let_go():
     motion = shoot(stage, x, v, 10, 0.2 * D)
     assert motion.wall_corrections == 0
     np.testing.assert_array_equal(
-        stage.in_order(stage.particles.velocity)[0], v.astype(number()).astype(float)
+        stage.in_order(stage.particles.velocity)[0], v.astype(float_dtype()).astype(float)
     )
 
 
@@ -234,12 +234,12 @@ def test_survey_tells_the_largest_speed_and_acceleration_and_counts_what_is_not_
     stage, generator = periodic(), np.random.default_rng(2)
     x, v = generator.uniform(0, 8 * D, (300, 3)), generator.normal(size=(300, 3))
     stage.put(x, v)
-    acceleration = np.zeros((CAPACITY, 3), number())
+    acceleration = np.zeros((CAPACITY, 3), float_dtype())
     acceleration[:300] = generator.normal(size=(300, 3))
     # Rows that are not live are not looked at.
     acceleration[300:] = np.nan
     stage.particles.acceleration.from_numpy(acceleration)
-    speed, largest, broken = survey(stage.particles)
+    speed, largest, broken = largest_speed_and_acceleration(stage.particles)
     assert speed == pytest.approx(np.linalg.norm(v, axis=1).max(), rel=1e-6)
     assert largest == pytest.approx(np.linalg.norm(acceleration[:300], axis=1).max(), rel=1e-6)
     assert broken == 0
@@ -247,4 +247,4 @@ def test_survey_tells_the_largest_speed_and_acceleration_and_counts_what_is_not_
     acceleration[200] = -np.inf
     stage.put(x, v)
     stage.particles.acceleration.from_numpy(acceleration)
-    assert survey(stage.particles)[2] == 3
+    assert largest_speed_and_acceleration(stage.particles)[2] == 3

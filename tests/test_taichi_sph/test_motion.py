@@ -10,7 +10,7 @@ from builders import (
     R,
     cubic_lattice,
     make_fluid,
-    model_of,
+    make_model,
     periodic,
     plane,
 )
@@ -42,7 +42,7 @@ def stirred(seed: int = 0, rows: np.ndarray | None = None, **options) -> Motion:
     rows = np.arange(len(x)) if rows is None else rows
     stage = plane()
     stage.put(x[rows], v[rows], rows)
-    return stage.motion(model_of(BLOOD), GRAVITY, SOUND, **options)
+    return stage.motion(make_model(BLOOD), GRAVITY, SOUND, **options)
 
 
 def state(motion: Motion) -> list[np.ndarray]:
@@ -110,7 +110,7 @@ def test_advancing_to_the_present_takes_no_step():
 def test_a_motion_without_blood_reaches_its_time():
     stage = plane()
     stage.put(np.zeros((0, 3)))
-    motion = stage.motion(model_of(BLOOD), GRAVITY)
+    motion = stage.motion(make_model(BLOOD), GRAVITY)
     motion.advance_to(0.5)
     assert (motion.time, motion.steps) == (0.5, 0)
 
@@ -169,7 +169,7 @@ def test_a_broken_particle_is_found_with_the_physics_too():
     stage = plane()
     stage.put(x, v)
     with pytest.raises(RunError, match=r"is not finite \(\d+ in all\) at t = 0 s, step 0"):
-        stage.motion(model_of(BLOOD), GRAVITY, SOUND).step(1.0)
+        stage.motion(make_model(BLOOD), GRAVITY, SOUND).step(1.0)
 
 
 def test_an_acceleration_that_is_not_finite_ends_the_run():
@@ -191,7 +191,7 @@ def test_blood_that_is_too_fast_ends_the_run_and_names_particle_and_limit():
     v[37] = [0.0, 2.0, 0.0]
     stage = plane()
     stage.put(x, v)
-    motion = stage.motion(model_of(BLOOD), GRAVITY, SOUND)
+    motion = stage.motion(make_model(BLOOD), GRAVITY, SOUND)
     with pytest.raises(RunError) as error:
         motion.step(1.0)
     assert re.match(
@@ -234,7 +234,7 @@ def ring(integrator: str, steps: int) -> np.ndarray:
     lattice = stage.reference(INVISCID).internal_energy()
     v = 0.02 * np.random.default_rng(3).normal(size=x.shape)
     stage.put(x, v)
-    motion = stage.motion(model_of(INVISCID), speed_limit=SOUND, integrator=integrator)
+    motion = stage.motion(make_model(INVISCID), speed_limit=SOUND, integrator=integrator)
     motion.step_limit = 0.1 * D / SOUND
     energies = [energy(motion) - lattice]
     for _ in range(5):
@@ -260,7 +260,7 @@ def test_wall_carries_the_weight_of_blood_at_rest_on_it():
     x = cubic_lattice(8, 8, 6)
     stage = plane()
     stage.put(x)
-    motion = stage.motion(model_of(BLOOD), GRAVITY, SOUND)
+    motion = stage.motion(make_model(BLOOD), GRAVITY, SOUND)
     motion.advance_to(0.1)
     lift = []
     for k in range(1, 21):

@@ -30,16 +30,16 @@ def carotid(time: np.ndarray, derivative: int = 0) -> np.ndarray:
     return flow if derivative else 1.0 + flow
 
 
-FINE = np.linspace(0.0, COMMON_CAROTID_PERIOD, 20_001)
-STRAIGHT = CHORD**2 / 8.0 * float(np.abs(carotid(FINE, 2)).max())
+FIXED_POINT_SCALE = np.linspace(0.0, COMMON_CAROTID_PERIOD, 20_001)
+STRAIGHT = CHORD**2 / 8.0 * float(np.abs(carotid(FIXED_POINT_SCALE, 2)).max())
 """How far a chord can be from its arc."""
 
 
 def test_the_chords_of_the_carotid_are_as_near_to_the_arc_as_its_curvature_says():
     assert np.diff(common_carotid().time) == pytest.approx(CHORD)
     assert STRAIGHT < 0.02
-    factor = [common_carotid()(t) for t in FINE]
-    np.testing.assert_allclose(factor, carotid(FINE), rtol=0, atol=STRAIGHT)
+    factor = [common_carotid()(t) for t in FIXED_POINT_SCALE]
+    np.testing.assert_allclose(factor, carotid(FIXED_POINT_SCALE), rtol=0, atol=STRAIGHT)
 
 
 def test_the_carotid_is_one_on_average_over_its_period():
@@ -51,10 +51,10 @@ def test_the_carotid_is_one_on_average_over_its_period():
 
 def test_the_carotid_peaks_at_twice_its_mean_early_in_the_beat():
     wave = common_carotid()
-    exact = carotid(FINE)
+    exact = carotid(FIXED_POINT_SCALE)
     assert wave.factor.max() == pytest.approx(exact.max(), abs=STRAIGHT)
     at = wave.time[wave.factor.argmax()]
-    assert at == pytest.approx(FINE[exact.argmax()], abs=CHORD)
+    assert at == pytest.approx(FIXED_POINT_SCALE[exact.argmax()], abs=CHORD)
     # What the benchmark's figure shows: some 13 ml/s within the first fifth of a beat; never back.
     assert 12.5 < wave.factor.max() * COMMON_CAROTID_MEAN < 14.0
     assert 0.1 < at < 0.22

@@ -16,7 +16,7 @@ import pytest
 
 from app.control.commands import Gravity, Inflow, Reset, Tool, Wound, as_dict, parse_command
 from app.control.session import MOST_WAITING, Session, read_script, read_session
-from app.models import maker_of
+from app.models import model_factory
 from commands import HERE, vesselflow
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import read_scene
@@ -35,9 +35,9 @@ def simulation(driven: Path) -> Simulation:
 def session(simulation: Simulation, tmp_path: Path) -> Iterator[Session]:
     simulation.reset()
     scene = simulation.scene
-    made = Session(simulation, {"implicit": maker_of("implicit", scene)}, tmp_path / "s.jsonl")
+    made = Session(simulation, {"implicit": model_factory("implicit", scene)}, tmp_path / "s.jsonl")
     yield made
-    simulation.switch(made.models["physics"])
+    simulation.use_model(made.models["physics"])
     made.close("tested")
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from app.control.page import ControlPage
 from app.control.session import Session
-from app.models import MODELS, maker_of
+from app.models import MODELS, model_factory
 from browser import Browser, needs_viser
 from fake_session import wait_until
 from taichi_sph.scene import read_scene
@@ -23,7 +23,7 @@ class Theatre:
     def __init__(self, folder: Path):
         scene = read_scene(folder / "scene.toml")
         self.simulation = Simulation.from_scene(scene)
-        makers = {name: maker_of(name, scene) for name in MODELS}
+        makers = {name: model_factory(name, scene) for name in MODELS}
         self.session = Session(self.simulation, makers, folder / "theatre.jsonl")
         self.closing = False
         self.thread = threading.Thread(target=self.run)

@@ -139,7 +139,7 @@ def test_a_recording_of_the_run_so_far_is_not_replaced(
 
 def test_a_checkpoint_that_cannot_be_written_is_named(whole: dict[str, Path]) -> None:
     kept = Checkpoint.read(whole["physics"])
-    simulation: Any = SimpleNamespace(snapshot=lambda: kept.state)
+    simulation: Any = SimpleNamespace(save_state=lambda: kept.state)
     figures: Any = None
     writer = Checkpointer(Path("/no/such/folder/a.npz"), 1, kept.facts)
     with pytest.raises(OSError, match=r"^/no/such/folder/a.npz: the checkpoint cannot be written"):

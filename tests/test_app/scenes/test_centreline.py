@@ -11,7 +11,7 @@ from app.scenes.centreline import Box, Tube, make_surface, read_shape, remake
 from places import VESSELS
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
-from taichi_sph.geometry.mesh import Nearest
+from taichi_sph.geometry.mesh import NearestPoint
 from taichi_sph.geometry.openings import load_surface
 
 NAMES = sorted(path.parent.name for path in VESSELS.glob("*/centreline.json"))
@@ -26,8 +26,8 @@ def test_the_seven_vessels_are_shipped() -> None:
 def test_shipped_surface_is_one_closed_skin_of_good_triangles(name: str) -> None:
     vertices, faces = load_surface(VESSELS / name / "lumen.ply")
     assert mesh.is_closed(faces)
-    assert mesh.is_oriented(faces)
-    assert mesh.pieces(faces, len(vertices))[0] == 1
+    assert mesh.is_winding_consistent(faces)
+    assert mesh.components(faces, len(vertices))[0] == 1
     assert mesh.genus(vertices, faces) == 0
     assert mesh.enclosed_volume(vertices, faces) > 0
     assert len(mesh.self_intersections(vertices, faces)) == 0
@@ -70,7 +70,7 @@ def test_remaking_the_aorta_gives_the_committed_surface(tmp_path: Path) -> None:
     assert triangles == pytest.approx(len(kept_faces), rel=0.01)
     assert volume == pytest.approx(mesh.enclosed_volume(kept, kept_faces), rel=1e-3)
     for points, other in ((made, (kept, kept_faces)), (kept, (made, made_faces))):
-        distance = Nearest(*other)(points)[0]
+        distance = NearestPoint(*other)(points)[0]
         assert distance.max() < 1e-4  # m
         assert distance.mean() < 5e-6
 

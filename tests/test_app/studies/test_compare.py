@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.studies.compare import result_of
-from app.studies.timed_run import Pour, Trace
+from app.studies.timed_run import TimedRun, Trace
 from places import ROOT
 
 INTERVAL = 0.1
@@ -18,7 +18,7 @@ FALL = np.array([0.0, -0.01, 0.0])
 """Way of the centre of mass in a frame [m]."""
 
 
-def run(drained: list[float], offset: float = 0.0, seconds: float = 1.0) -> Pour:
+def run(drained: list[float], offset: float = 0.0, seconds: float = 1.0) -> TimedRun:
     """A run whose centre falls by FALL a frame, `offset` [m] to the side."""
     frames = len(drained)
     simulation = SimpleNamespace(
@@ -36,7 +36,7 @@ def run(drained: list[float], offset: float = 0.0, seconds: float = 1.0) -> Pour
         compression=[0.01 * k for k in range(frames)],
     )
     seconds_each = [9.0] + [seconds] * (frames - 1)
-    return Pour("x", simulation, trace, seconds=seconds_each, compiled=10)  # type: ignore[arg-type]
+    return TimedRun("x", simulation, trace, seconds=seconds_each, compiled=10)  # type: ignore[arg-type]
 
 
 def test_a_run_beside_itself_differs_in_nothing():

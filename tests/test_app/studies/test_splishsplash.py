@@ -19,7 +19,7 @@ from app.studies.splishsplash import (
     has_peer,
     wall_behind,
 )
-from app.studies.timed_run import RULES, Pour, Trace
+from app.studies.timed_run import RULES, TimedRun, Trace
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.vessel import read_vessel
 from taichi_sph.scene import Scene
@@ -174,9 +174,9 @@ def test_what_has_left_is_counted_once_and_stays_out() -> None:
     assert last.max_speed < 1.0
 
 
-def pour(method: Method) -> Pour:
+def pour(method: Method) -> TimedRun:
     """Three frames, judged."""
-    poured = Pour(method.name, method.simulation(small()), Trace(0.005), rules=RULES)
+    poured = TimedRun(method.name, method.simulation(small()), Trace(0.005), rules=RULES)
     for frame in range(1, 4):
         poured.frame(0.005 * frame)
     # Views of foreign memory do not travel.

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.studies.timed_run import RULES, Grid, Pour, Trace, broken_rule, clumped_part, errors_of
+from app.studies.timed_run import RULES, Grid, TimedRun, Trace, broken_rule, clumped_part, errors_of
 from taichi_sph.diagnostics import Diagnostics
 from taichi_sph.errors import RunError
 
@@ -136,7 +136,7 @@ def test_a_run_that_diverges_is_dead_from_then_on():
             return FIGURES
 
     made = Diverging(**vars(simulation()))
-    pour = Pour("x", made, Trace(0.1), rules=RULES)  # type: ignore[arg-type]
+    pour = TimedRun("x", made, Trace(0.1), rules=RULES)  # type: ignore[arg-type]
     for k in range(1, 5):
         pour.frame(0.1 * k)
     assert pour.death == "the run diverged"

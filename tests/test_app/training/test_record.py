@@ -25,8 +25,8 @@ from app.training.record import (
     record_run,
 )
 from nn import dataset
-from nn.dataset import Dataset, State, check
-from nn.training.rollout import Stage
+from nn.dataset import Dataset, RecordedState, check
+from nn.training.rollout import ReplaySimulation
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry.vessel import read_vessel
 from taichi_sph.scene import read_scene
@@ -87,10 +87,10 @@ def recorded(make: Maker, tmp_path_factory: pytest.TempPathFactory) -> Recording
 
 def test_a_state_says_all_that_its_future_needs(scene_file: Path) -> None:
     scene = read_scene(scene_file)
-    simulation = Stage(scene, read_vessel(scene), 0)
+    simulation = ReplaySimulation(scene, read_vessel(scene), 0)
     interval = 2 * simulation.derived.step  # lists last longer than that
 
-    def advance(frame: int) -> State:
+    def advance(frame: int) -> RecordedState:
         simulation.advance_to(frame * interval)
         simulation.settle()
         return simulation.state()

@@ -11,20 +11,20 @@ import taichi as ti
 from scipy.spatial import cKDTree
 
 from app.scenes.centreline import Tube, make_surface
-from builders import number, precision
+from builders import float_dtype, precision
 from meshes import RADIUS, write_scene
 from taichi_sph.boundary.inflow import (
-    FINE,
+    FIXED_POINT_SCALE,
+    HYSTERESIS,
     LEAST_APART,
-    RISE,
-    SLACK,
-    drive_plugs,
-    plug_layers,
-    plug_sites,
+    RAMP_TIME,
+    buffer_layers,
+    buffer_sites,
+    drive_buffers,
+    flow_extension,
     rim_distance,
-    sleeve,
 )
-from taichi_sph.boundary.outlets import LOST
+from taichi_sph.boundary.outlets import OUT_OF_BOX
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry.mesh import plane_axes
 from taichi_sph.geometry.openings import Opening
@@ -118,7 +118,7 @@ def test_the_distance_to_a_polygon_is_that_to_its_nearest_point(shape):
 @pytest.mark.parametrize("shape", RIMS)
 def test_sites_are_a_spacing_apart_and_half_a_spacing_inside_the_rim(shape, spacing):
     rim, opening = in_space(RIMS[shape](5e-3))
-    sites = plug_sites(rim, opening, spacing)
+    sites = buffer_sites(rim, opening, spacing)
     assert np.abs((sites - CENTRE) @ NORMAL).max() < 1e-12
     apart = between(sites, sites)
     np.fill_diagonal(apart, np.inf)
@@ -137,7 +137,7 @@ def test_sites_are_a_spacing_apart_and_half_a_spacing_inside_the_rim(shape, spac
 @pytest.mark.parametrize("shape", RIMS)
 def test_sites_take_up_the_opening_but_for_its_rim(shape, spacing):
     rim, opening = in_space(RIMS[shape](5e-3))
-    taken = len(plug_sites(rim, opening, spacing)) * spacing**2
+    taken = len(buffer_sites(rim, opening, spacing)) * spacing**2
     around = np.linalg.norm(np.roll(rim, -1, axis=0) - rim, axis=1).sum()
     # Lattice points in an area fill it but for a few; all keep half a spacing from the rim.
     few = 2.0 * spacing**2
@@ -157,7 +157,7 @@ def test_an_opening_too_narrow_for_one_particle_is_one_sentence(driven):
 def test_the_sleeve_stands_a_setback_outside_the_rim_evenly_and_faces_out(shape):
     rim, opening = in_space(RIMS[shape](5e-3))
     spacing, setback, depth = 0.7e-3, 0.65e-3, 5e-3
-    points, normals = sleeve(rim, opening, spacing, setback, depth)
+    points, normals = flow_extension(rim, opening, spacing, setback, depth)
     along = (points - CENTRE) @ NORMAL
     # In rings a spacing apart, the first half a spacing beyond the plane, as far as asked.
     levels = np.unique(along.round(9))
@@ -238,9 +238,9 @@ def area(sim: Simulation) -> float:
 
 
 def plug_numbers(x: np.ndarray, sim: Simulation) -> np.ndarray:
-    """Number of the plug that each point belongs to by the words of `Gates`, (n,)."""
+    """Number of the plug that each point belongs to by the words of `BufferRegions`, (n,)."""
     found = np.full(len(x), -1)
-    depth = (plug_layers(D, 2.0 * D) + 2) * D
+    depth = (buffer_layers(D, 2.0 * D) + 2) * D
     for k, piston in enumerate(sim.pistons):
         r = x - piston.opening.centre
         along = r @ piston.opening.normal
@@ -253,8 +253,8 @@ def plug_numbers(x: np.ndarray, sim: Simulation) -> np.ndarray:
 @ti.kernel
 def number_of(gates: ti.template(), x: ti.types.ndarray(ndim=2), out: ti.types.ndarray(ndim=2)):
     for i in range(x.shape[0]):
-        k = gates.plug_of(ti.Vector([x[i, 0], x[i, 1], x[i, 2]]))
-        inward = gates.way_in(k)
+        k = gates.buffer_at(ti.Vector([x[i, 0], x[i, 1], x[i, 2]]))
+        inward = gates.inward_normal(k)
         out[i, 0] = ti.cast(k, float)
         for a in ti.static(range(3)):
             out[i, 1 + a] = inward[a]
@@ -263,8 +263,8 @@ def number_of(gates: ti.template(), x: ti.types.ndarray(ndim=2), out: ti.types.n
 def test_a_position_belongs_to_the_plug_that_numpy_says(driven):
     generator = np.random.default_rng(1)
     x = generator.uniform(-1.5, 1.5, (20_000, 3)) * [RADIUS, RADIUS, 0.5 * LENGTH + 4.0 * D]
-    x = np.ascontiguousarray(x, number())
-    out = np.zeros((len(x), 4), number())
+    x = np.ascontiguousarray(x, float_dtype())
+    out = np.zeros((len(x), 4), float_dtype())
     number_of(driven.plugs.gates, x, out)
     expected = plug_numbers(x.astype(float), driven)
     # In f32 a few lie on a face to within rounding.
@@ -278,7 +278,7 @@ def test_a_position_belongs_to_the_plug_that_numpy_says(driven):
 def test_a_plug_is_full_columns_at_golden_leads_clear_of_the_blood_in_the_vessel(driven):
     x = driven.positions()
     number_ = plug_numbers(x, driven)
-    layers = plug_layers(D, 2.0 * D)
+    layers = buffer_layers(D, 2.0 * D)
     apart = between(x, x)
     np.fill_diagonal(apart, np.inf)
     assert apart.min() > 0.8 * D * (1.0 - 1e-6)
@@ -299,20 +299,20 @@ def test_a_plug_is_full_columns_at_golden_leads_clear_of_the_blood_in_the_vessel
 
 
 def orders_of(sim: Simulation, *rows: tuple[float, float, float, float]) -> np.ndarray:
-    return np.array(rows, number())
+    return np.array(rows, float_dtype())
 
 
 def test_plugs_get_the_mean_acceleration_and_the_push_whatever_the_order_of_the_rows(driven):
     generator, particles = np.random.default_rng(2), driven.particles
     n, dt, force = 1200, 1e-3, 3.0
     x = generator.uniform(-1.0, 1.0, (n, 3)) * [RADIUS, RADIUS, 0.5 * LENGTH + 4.0 * D]
-    x = x.astype(number()).astype(float)
-    a = (50.0 * generator.normal(size=(n, 3))).astype(number()).astype(float)
+    x = x.astype(float_dtype()).astype(float)
+    a = (50.0 * generator.normal(size=(n, 3))).astype(float_dtype()).astype(float)
     speeds, members = [], []
     for order in (np.arange(n), generator.permutation(n), np.arange(n)[::-1]):
         particles.replace(identity=np.arange(n), position=x[order], acceleration=a[order])
         orders = orders_of(driven, (1.0, 200.0, force, 0.1), (1.0, -100.0, -force, -0.2))
-        drive_plugs(particles, driven.plugs, orders, dt)
+        drive_buffers(particles, driven.plugs, orders, dt)
         speeds.append(driven.plugs.speed.to_numpy())
         np.testing.assert_array_equal(orders[:, 3], speeds[-1])
         members.append(driven.plugs.members.to_numpy())
@@ -326,18 +326,22 @@ def test_plugs_get_the_mean_acceleration_and_the_push_whatever_the_order_of_the_
         assert members[0][k] == inside.sum() > 100
         mean = (a[inside] @ -piston.opening.normal).mean()
         expected = u + dt * (mean - g + push / inside.sum())
-        assert speeds[0][k] == pytest.approx(expected, abs=dt / FINE + COUNTING[precision()])
+        assert speeds[0][k] == pytest.approx(
+            expected, abs=dt / FIXED_POINT_SCALE + COUNTING[precision()]
+        )
 
 
 def test_a_given_flow_is_the_speed_whatever_blood_does(driven):
     orders = orders_of(driven, (0.0, 0.3, 5.0, 9.0), (0.0, -0.1, 5.0, 9.0))
-    drive_plugs(driven.particles, driven.plugs, orders, 1e-3)
-    np.testing.assert_array_equal(driven.plugs.speed.to_numpy(), np.array([0.3, -0.1], number()))
+    drive_buffers(driven.particles, driven.plugs, orders, 1e-3)
+    np.testing.assert_array_equal(
+        driven.plugs.speed.to_numpy(), np.array([0.3, -0.1], float_dtype())
+    )
 
 
 def test_columns_add_at_their_far_ends_as_they_have_moved_and_trembling_adds_nothing(driven):
     pistons, (piston, _) = driven._pistons, driven.pistons
-    generator, layers = np.random.default_rng(3), plug_layers(D, 2.0 * D)
+    generator, layers = np.random.default_rng(3), buffer_layers(D, 2.0 * D)
     golden = (np.arange(len(piston.sites)) * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0
     way, added = 0.0, 0
     for goal in (3.0, 2.9, 3.1, -2.5, 4.0):
@@ -349,7 +353,7 @@ def test_columns_add_at_their_far_ends_as_they_have_moved_and_trembling_adds_not
             moved = way + golden
             # A column's last particle is within the last layer, or SLACK beyond it.
             assert np.all(moved - piston.taken <= 1.0)
-            assert np.all(moved - piston.taken >= -SLACK - 0.05)
+            assert np.all(moved - piston.taken >= -HYSTERESIS - 0.05)
             due = piston.taken > before
             assert len(x) == len(v) == due.sum()
             depth = (x - piston.opening.centre) @ piston.opening.normal / D
@@ -365,7 +369,7 @@ def test_columns_add_at_their_far_ends_as_they_have_moved_and_trembling_adds_not
         if goal == 3.1:
             # Back by a tenth and on by two: no more than the new tenth brings.
             assert added - so_far <= 0.12 * len(piston.sites) + STAGGERED
-    assert abs(piston.taken.sum() - len(piston.sites) * way) <= STAGGERED + SLACK * len(
+    assert abs(piston.taken.sum() - len(piston.sites) * way) <= STAGGERED + HYSTERESIS * len(
         piston.sites
     )
 
@@ -387,9 +391,9 @@ def test_the_account_closes_and_what_is_added_is_what_the_pump_pushes(driven):
         driven.advance_to(end * frame / 6)
         assert_account_is_whole(driven, initial)
         t = driven.time
-        level = min(1.0, t / RISE)
+        level = min(1.0, t / RAMP_TIME)
         assert driven.plugs.speed[0] == pytest.approx(FLOW * level / area(driven), rel=1e-6)
-        pushed = FLOW * (t - 0.5 * RISE if t > RISE else 0.5 * t**2 / RISE)
+        pushed = FLOW * (t - 0.5 * RAMP_TIME if t > RAMP_TIME else 0.5 * t**2 / RAMP_TIME)
         # The speed at the end of each step for all of it: half a step's flow more, at most.
         assert driven.pistons[0].pushed == pytest.approx(
             pushed, abs=0.6 * FLOW * 1e-4 + 1e-3 * pushed
@@ -402,7 +406,7 @@ def test_the_account_closes_and_what_is_added_is_what_the_pump_pushes(driven):
     assert abs(driven.pistons[0].taken.sum() - driven.pistons[0].pushed / OF_ONE) < bound
     # It came out at the other end, through the plug there, and nowhere else.
     account = driven.exits.account()
-    assert account[LOST] == 0
+    assert account[OUT_OF_BOX] == 0
     assert account[2:].sum() == account[3] > 100
     assert driven.diagnostics().leaks == 0
     assert driven.diagnostics().added_volume == pytest.approx(driven.added * OF_ONE)
@@ -449,7 +453,7 @@ def test_a_flow_that_turns_neither_leaks_nor_adds_blood_on_top_of_other(driven):
     assert max(ways[-3:]) - min(ways) > 4.0
     assert LEAST_APART * D * (1.0 - 1e-5) <= least < D
     account = driven.exits.account()
-    assert account[LOST] == 0
+    assert account[OUT_OF_BOX] == 0
     # Out through the plug's far end and in again.
     assert account[2] > 100
     assert driven.added > 100
@@ -466,14 +470,14 @@ def packed(tube: Simulation) -> tuple[list[tuple[float, float, float]], object]:
     history = []
     for frame in range(1, 126):
         tube.advance_to(0.002 * frame)
-        state = tube.fluid.state
+        state = tube.fluid.equation_of_state
         x = tube.positions()
         density = tube.particles.in_order(tube.particles.density).astype(float)
         inner = density[np.abs(x[:, 2]) < 0.3 * LENGTH]
         b = DENSITY * state.sound_speed**2 / 7.0
         pressure = np.maximum(0.0, b * ((inner / DENSITY) ** 7 - 1.0)).mean()
         history.append((*(p.speed for p in tube.pistons), pressure))
-    return history, tube.snapshot()
+    return history, tube.save_state()
 
 
 def test_blood_between_reservoirs_of_one_pressure_comes_to_rest_under_it(driven, packed):
@@ -489,7 +493,7 @@ def test_blood_between_reservoirs_of_one_pressure_comes_to_rest_under_it(driven,
     assert 100.0 * (taken - RINGING) < pressure[-25:].mean() < 100.0 * (1.0 + RINGING)
     drive(driven, "top", pressure=100.0)
     drive(driven, "bottom", pressure=100.0)
-    driven.go_on_from(state)
+    driven.load_state(state)
     assert np.linalg.norm(driven.velocities(), axis=1).mean() < REST * jet
     assert driven.diagnostics().leaks == 0
 
@@ -502,7 +506,7 @@ def test_more_pressure_on_one_side_accelerates_the_column_by_dp_over_rho_l(drive
     for extra in (0.0, more):
         drive(driven, "top", pressure=100.0 + extra)
         drive(driven, "bottom", pressure=100.0)
-        driven.go_on_from(packed[1])
+        driven.load_state(packed[1])
         begin = driven.time
         driven.advance_to(begin + time)
         moved.append(driven.velocities().astype(float).sum(axis=0))
@@ -510,7 +514,7 @@ def test_more_pressure_on_one_side_accelerates_the_column_by_dp_over_rho_l(drive
     # What rings on is the same in both.
     speed = (moved[0] - moved[1]) / count
     length = count * OF_ONE / area(driven)
-    assert length == pytest.approx(LENGTH + 2 * plug_layers(D, 2.0 * D) * D, rel=0.25)
+    assert length == pytest.approx(LENGTH + 2 * buffer_layers(D, 2.0 * D) * D, rel=0.25)
     expected = more / (DENSITY * length) * time
     assert speed[2] == pytest.approx(expected, rel=PUSHED)
     assert np.abs(speed[:2]).max() < 0.02 * expected
@@ -524,12 +528,12 @@ def test_a_reservoir_spends_head_on_the_speed_of_what_it_gives(tmp_path):
     for name in ENDS:
         drive(sim, name, pressure=400.0)
     sim.advance_to(0.1)
-    state = sim.snapshot()
+    state = sim.save_state()
     velocity = np.zeros_like(state.velocity)
     velocity[:, 2] = -speed
     for row, piston in zip(state.controls["pistons"], sim.pistons, strict=True):
         row[2] = speed * float(piston.opening.normal[2])
-    sim.go_on_from(replace(state, velocity=velocity))
+    sim.load_state(replace(state, velocity=velocity))
     length = sim.particles.count[None] * OF_ONE / area(sim)
     sim.advance_to(state.time + time)
     slowed = speed / (1.0 + 0.5 * speed * time / length)
@@ -562,12 +566,12 @@ def test_an_opening_that_nothing_drives_cannot_be_turned_up(driven):
 def test_a_pump_that_is_turned_gets_there_in_the_time_of_rising(driven, factor):
     driven.pistons[0].level = driven.pistons[1].level = 1.0
     driven.drive(factor, "top")
-    levels, dt = [], RISE / 100.0
+    levels, dt = [], RAMP_TIME / 100.0
     for _ in range(100):
         driven._pistons.advance(driven.particles, 0.0, dt, (0.0, 0.0, 0.0))
         levels.append(driven.pistons[0].level)
     assert levels[-1] == pytest.approx(factor)
-    assert np.abs(np.diff(levels)).max() <= dt / RISE * (1.0 + 1e-9)
+    assert np.abs(np.diff(levels)).max() <= dt / RAMP_TIME * (1.0 + 1e-9)
     assert driven.pistons[1].level == 1.0
 
 
@@ -578,7 +582,7 @@ def test_state_of_a_piston_is_numbers_and_comes_back(driven):
     taken, speed, way = piston.taken.copy(), piston.speed, piston.way
     driven.advance_to(0.03)
     assert piston.way > way
-    piston.go_on_from(kept)
+    piston.load_state(kept)
     assert (piston.speed, piston.way) == (speed, way)
     np.testing.assert_array_equal(piston.taken, taken)
     assert piston.taken.dtype == np.int64

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from builders import CAPACITY, D, Stage, number, precision, sphere
-from taichi_sph.boundary.outlets import LOST, MOST_DROPS, SUCTION, Exits, suck
+from builders import CAPACITY, D, Setup, float_dtype, precision, sphere
+from taichi_sph.boundary.outlets import MOST_DROPS, OUT_OF_BOX, SUCTION, Outlets, suck
 
 ROUNDING = {"f64": 1e-12, "f32": 1e-6}
 """Positions and sums of two or three terms, over the box or the largest term."""
@@ -21,11 +21,11 @@ BESIDE = ((5.0, 1.0, 0.0), (5.0, 1.0, 0.0), (0.6, 0.8, 0.0), 7.0)
 
 
 @cache
-def exits() -> Exits:
-    return Exits(4)
+def exits() -> Outlets:
+    return Outlets(4)
 
 
-def clear() -> Exits:
+def clear() -> Outlets:
     """The exits as they were made: all shut, nothing has left."""
     e = exits()
     e.reach.fill(0.0)
@@ -34,19 +34,21 @@ def clear() -> Exits:
     return e
 
 
-def opened(k: int, exit_: tuple, drips: bool = False) -> None:
+def opened(k: int, exit_: tuple, track_droplets: bool = False) -> None:
     begin, end, normal, reach = exit_
-    exits().open(k, D * np.array(begin), D * np.array(end), np.array(normal), D * reach, drips)
+    exits().open(
+        k, D * np.array(begin), D * np.array(end), np.array(normal), D * reach, track_droplets
+    )
 
 
 def cloud(seed: int, count: int = CAPACITY) -> tuple[np.ndarray, np.ndarray]:
     """Points all over the round vessel's box and a little beyond it, and velocities."""
     generator = np.random.default_rng(seed)
-    x = generator.uniform(-10.5 * D, 11.0 * D, (count, 3)).astype(number()).astype(float)
-    return x, generator.normal(size=x.shape).astype(number()).astype(float)
+    x = generator.uniform(-10.5 * D, 11.0 * D, (count, 3)).astype(float_dtype()).astype(float)
+    return x, generator.normal(size=x.shape).astype(float_dtype()).astype(float)
 
 
-def corners(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+def corners(stage: Setup) -> tuple[np.ndarray, np.ndarray]:
     grid = stage.neighbors.grid
     lower = np.array(grid.lower)
     return lower, lower + np.array(grid.cell) * np.array(grid.shape)
@@ -68,7 +70,7 @@ def beyond(x: np.ndarray, exit_: tuple) -> tuple[np.ndarray, np.ndarray]:
     return left, np.minimum(np.abs(height), np.abs(distance - exit_[3]))
 
 
-def names(stage: Stage) -> np.ndarray:
+def names(stage: Setup) -> np.ndarray:
     return stage.particles.identity.to_numpy()[: stage.particles.count[None]]
 
 
@@ -85,7 +87,7 @@ def test_what_has_left_and_by_which_exit_is_what_brute_force_says(seed):
     lower, upper = corners(stage)
     outside = ((x < lower) | (x > upper)).any(axis=1)
     doubt = np.abs(np.stack([x - lower, x - upper])).min(axis=(0, 2)) / D
-    expected = np.where(outside, -2 - LOST, np.arange(len(x)))
+    expected = np.where(outside, -2 - OUT_OF_BOX, np.arange(len(x)))
     for k, each in ((3, BESIDE), (2, CUT), (0, ROUND)):
         left, near = beyond(x, each)
         expected[left] = -4 - k
@@ -98,7 +100,7 @@ def test_what_has_left_and_by_which_exit_is_what_brute_force_says(seed):
     assert {-2, -4, -6, -7} <= set(found.tolist())
     assert (beyond(x, ROUND)[0] & beyond(x, BESIDE)[0]).any()
     assert (beyond(x, CUT)[0] & outside).any()
-    places = {LOST: -2, SUCTION: -3} | {2 + k: -4 - k for k in range(4)}
+    places = {OUT_OF_BOX: -2, SUCTION: -3} | {2 + k: -4 - k for k in range(4)}
     counted = [int((found == name).sum()) for _, name in sorted(places.items())]
     np.testing.assert_array_equal(e.account(), counted)
     assert e.account()[[SUCTION, 3]].tolist() == [0, 0]
@@ -159,7 +161,7 @@ def dripped(seed: int, time: float) -> tuple[np.ndarray, np.ndarray]:
     """Mark a cloud at a time; positions and velocities of what has left through exit 2."""
     stage = sphere()
     opened(1, ROUND)
-    opened(2, CUT, drips=True)
+    opened(2, CUT, track_droplets=True)
     x, v = cloud(seed)
     stage.put(x, v)
     exits().mark(stage.particles, stage.neighbors.grid, time)

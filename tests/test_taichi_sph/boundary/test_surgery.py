@@ -17,7 +17,7 @@ from builders import precision
 from meshes import write_scene
 from places import VESSELS
 from reference import proxy_volumes
-from taichi_sph.boundary.outlets import LOST, SUCTION
+from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION
 from taichi_sph.boundary.surgery import LEAST_RADIUS, MOST_WOUNDS, Surgery, Wound
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.errors import InputError, RunError
@@ -86,7 +86,7 @@ class Opened:
     clamped: list[np.ndarray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        def opened(k, begin, end, normal, reach, drips=False):
+        def opened(k, begin, end, normal, reach, track_droplets=False):
             self.exits[k] = (begin, end, normal, reach)
 
         exits: Any = SimpleNamespace(
@@ -398,7 +398,7 @@ def test_blood_leaves_through_a_wound_is_counted_and_no_faster_than_a_free_jet(s
         counts.append(int(sim.exits.account()[place]))
     assert np.all(np.diff([0, *counts]) > 0)
     account = sim.exits.account()
-    assert account[LOST] == 0
+    assert account[OUT_OF_BOX] == 0
     assert account[[SUCTION, 3]].tolist() == [0, 0]
     figures = sim.diagnostics()
     assert figures.leaks == 0
@@ -423,7 +423,7 @@ def test_a_clamp_stops_the_bleeding_whenever_it_comes_and_throws_nobody_out(sim)
     for frame in range(4):
         time = 0.06 + 0.003 * frame
         sim.advance_to(time)
-        kept = sim.snapshot()
+        kept = sim.save_state()
         open_ = int(sim.exits.account()[place])
         sim.clamp(0)
         clamped = int(sim.exits.account()[place])
@@ -440,7 +440,7 @@ def test_a_clamp_stops_the_bleeding_whenever_it_comes_and_throws_nobody_out(sim)
         assert int(sim.exits.account()[place]) == clamped
         assert_account_is_whole(sim)
         assert sim.diagnostics().leaks == 0
-        sim.go_on_from(kept)
+        sim.load_state(kept)
     # Blood that is stopped turns aside; it gets no faster than the jet that it was, or twice that
     # where two streams meet.
     assert {time: speed for time, speed in speeds.items() if speed > 2.0 * fastest} == {}
@@ -484,7 +484,7 @@ def test_a_mere_tip_has_the_lists_built_only_where_it_sucks(sim, monkeypatch):
 
 def state_of(sim: Simulation) -> tuple[list[np.ndarray], dict]:
     """All that is to be the same bit by bit."""
-    kept = sim.snapshot()
+    kept = sim.save_state()
     order = np.argsort(kept.identity)
     rows = [getattr(kept, name)[order] for name in
             ("identity", "position", "velocity", "acceleration", "density")]  # fmt: skip
@@ -502,7 +502,7 @@ def test_a_session_goes_on_bitwise_with_wounds_suction_a_moving_tool_and_a_tilt(
     sim.advance_to(0.026)
     sim.clamp(0)
     sim.advance_to(0.03)
-    kept = sim.snapshot()
+    kept = sim.save_state()
     # As a file keeps it.
     controls = msgspec.json.decode(msgspec.json.encode(kept.controls))
     assert controls == kept.controls
@@ -519,7 +519,7 @@ def test_a_session_goes_on_bitwise_with_wounds_suction_a_moving_tool_and_a_tilt(
     sim.wound(SIDE, LEAST_RADIUS * D)
     sim.move_tool(np.array([0.0, 2e-3, 0.0]))
     sim.advance_to(sim.time + 0.002)
-    sim.go_on_from(replace(kept, controls=controls))
+    sim.load_state(replace(kept, controls=controls))
     assert sim.time == 0.03
     assert [w.is_open for w in sim.surgery.wounds] == [False, True]
     sim.advance_to(0.036)
@@ -536,7 +536,7 @@ def test_a_session_goes_on_bitwise_from_the_step_in_which_the_tool_arrives(sim):
     while np.linalg.norm(tool.wanted_position - tool.position) >= 1e-7:
         sim.step(1.0)
     assert tool.velocity.any()
-    kept = sim.snapshot()
+    kept = sim.save_state()
 
     def some_steps() -> list[np.ndarray]:
         for _ in range(5):
@@ -545,7 +545,7 @@ def test_a_session_goes_on_bitwise_from_the_step_in_which_the_tool_arrives(sim):
 
     expected = some_steps()
     sim.reset()
-    sim.go_on_from(kept)
+    sim.load_state(kept)
     assert_same(some_steps(), expected)
 
 

@@ -20,12 +20,12 @@ from builders import (
     D,
     Prescribed,
     R,
-    Stage,
+    Setup,
     ball,
     calibration,
+    float_dtype,
     make_fluid,
-    model_of,
-    number,
+    make_model,
     precision,
     sphere,
 )
@@ -84,7 +84,7 @@ def shape(tmp_path_factory: pytest.TempPathFactory) -> Shape:
 
 
 @cache
-def _stage(count: int) -> Stage:
+def _stage(count: int) -> Setup:
     """The round vessel once more, with room for the proxies of a tool."""
     vessel, edge = sphere(), 9.1 * D
     y, n = vessel.wall_position, vessel.wall_normal
@@ -92,11 +92,11 @@ def _stage(count: int) -> Stage:
     grid = make_grid(np.full(3, -edge), np.full(3, edge), R + SKIN)
     neighbors = Neighbors.allocate(grid, R, SKIN, CAPACITY, D, wall)
     neighbors.sort_wall(wall)
-    return Stage(vessel.particles, wall, neighbors, y, n)
+    return Setup(vessel.particles, wall, neighbors, y, n)
 
 
 @pytest.fixture
-def stage(shape: Shape) -> Stage:
+def stage(shape: Shape) -> Setup:
     """Blood round the ball in the round vessel, the ball in the middle and at rest."""
     stage = _stage(len(shape.position))
     stage.wall.velocity.fill(0.0)
@@ -113,7 +113,7 @@ def middle(at: np.ndarray, turn: Rotation = TURN) -> np.ndarray:
     return at + turn.apply([0.0, 0.0, BALL])
 
 
-def hold(stage: Stage, shape: Shape, at: np.ndarray = AT, turn: Rotation = TURN,
+def hold(stage: Setup, shape: Shape, at: np.ndarray = AT, turn: Rotation = TURN,
          velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
          spin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tool:  # fmt: skip
     """Put the tool somewhere, in motion."""
@@ -124,7 +124,7 @@ def hold(stage: Stage, shape: Shape, at: np.ndarray = AT, turn: Rotation = TURN,
     return tool
 
 
-def proxies(stage: Stage, field: str = "position") -> np.ndarray:
+def proxies(stage: Setup, field: str = "position") -> np.ndarray:
     """Rows of the wall, those of the tool last."""
     return getattr(stage.wall, field).to_numpy().astype(float)
 
@@ -217,7 +217,7 @@ def test_a_surface_that_is_not_there_is_one_sentence(tmp_path):
 # Lists
 
 
-def listed(stage: Stage) -> np.ndarray:
+def listed(stage: Setup) -> np.ndarray:
     """Which proxies are on the list of each row, (n, m); one listed twice is refused."""
     n, nb = stage.particles.count[None], stage.neighbors
     counts, index = nb.wall_count.to_numpy()[:n], nb.wall_index.to_numpy()[:n]
@@ -228,7 +228,7 @@ def listed(stage: Stage) -> np.ndarray:
     return table.astype(bool)
 
 
-def distances(stage: Stage) -> np.ndarray:
+def distances(stage: Setup) -> np.ndarray:
     """From rows to proxies [m], (n, m)."""
     x = stage.particles.position.to_numpy()[: stage.particles.count[None]].astype(float)
     return np.linalg.norm(separations(x, proxies(stage)), axis=-1)
@@ -345,7 +345,7 @@ class Moving(Blood):
         return -(psi * push)[..., None] * self.grad_wall
 
 
-def brute_force(stage: Stage, fluid) -> Moving:
+def brute_force(stage: Setup, fluid) -> Moving:
     """The state in the fields, proxies of wall and tool alike."""
     known = vars(stage.reference(fluid))
     arguments = {name: known[name] for name in Blood.__dataclass_fields__}
@@ -367,7 +367,7 @@ def test_what_a_tool_that_moves_and_turns_does_to_blood_is_brute_force(stage, sh
     hold(stage, shape, AT, TURN, *MOTION)
     found = stage.accelerate(fluid, (1.0, -2.0, -9.81))
     moving = brute_force(stage, fluid)
-    assert_close(stage.in_order(model_of(fluid).viscosity), moving.viscosity(fluid.nested),
+    assert_close(stage.in_order(make_model(fluid).viscosity), moving.viscosity(fluid.nested),
                  SUMS[precision()] + SERIES)  # fmt: skip
     expected = moving.acceleration(np.array([1.0, -2.0, -9.81]), nested=fluid.nested)
     assert_close(found, expected, SUMS[precision()] + SERIES)
@@ -377,12 +377,12 @@ def test_what_a_tool_that_moves_and_turns_does_to_blood_is_brute_force(stage, sh
     assert np.abs(change).max() > 0.01 * np.abs(expected).max()
 
 
-def in_the_train(stage: Stage) -> None:
+def in_the_train(stage: Setup) -> None:
     """Let blood, wall and tool move along."""
     v = stage.particles.velocity.to_numpy()
-    stage.particles.velocity.from_numpy((v + TRAIN).astype(number()))
+    stage.particles.velocity.from_numpy((v + TRAIN).astype(float_dtype()))
     velocity = proxies(stage, "velocity") + TRAIN
-    stage.wall.velocity.from_numpy(velocity.astype(number()))
+    stage.wall.velocity.from_numpy(velocity.astype(float_dtype()))
 
 
 @pytest.mark.parametrize("fluid", [BLOOD, NESTED], ids=["pairwise", "nested"])
@@ -438,9 +438,11 @@ def test_divergence_feels_the_tool_come(stage, shape):
     assert_close(found, rate, SUMS[precision()])
 
 
-def force(stage: Stage, fluid) -> np.ndarray:
+def force(stage: Setup, fluid) -> np.ndarray:
     """Of the blood on the tool, right after `accelerate` [N], (3,)."""
-    found = force_on_tool(stage.particles, stage.wall, stage.neighbors, *model_of(fluid).pairwise)
+    found = force_on_tool(
+        stage.particles, stage.wall, stage.neighbors, *make_model(fluid).pair_coefficients
+    )
     return np.array([found[a] for a in range(3)])
 
 
@@ -464,7 +466,7 @@ def test_what_the_tool_takes_from_blood_is_momentum_of_the_blood_that_particles_
     with_tool = stage.accelerate(BLOOD)
     found = force(stage, BLOOD)
     # The same forces once more, the tool's proxies struck from the lists.
-    nb, model = stage.neighbors, model_of(BLOOD)
+    nb, model = stage.neighbors, make_model(BLOOD)
     counts, index = nb.wall_count.to_numpy(), nb.wall_index.to_numpy()
     for row in range(stage.particles.count[None]):
         kept = index[row, : counts[row]]

@@ -15,11 +15,11 @@ from app.scenes.centreline import Tube, make_surface
 from app.view.rerun_view import RerunView
 from builders import precision
 from meshes import write_scene
-from nn.training.rollout import Stage
+from nn.training.rollout import ReplaySimulation
 from recordings import rows, static
 from reference import proxy_volumes
-from taichi_sph.boundary.inflow import RISE
-from taichi_sph.boundary.wall_motion import LAG, LARGEST, Pulse, read_pulse
+from taichi_sph.boundary.inflow import RAMP_TIME
+from taichi_sph.boundary.wall_motion import LAG, LARGEST, WallMotion, read_wall_motion
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.vessel import read_vessel
 from taichi_sph.particles.wall import Proxies
@@ -99,14 +99,14 @@ def sim(pulsing: Simulation) -> Simulation:
 
 @pytest.mark.parametrize("waveform", [cosine(), common_carotid()], ids=["cosine", "carotid"])
 def test_the_level_goes_from_the_surface_of_the_file_to_the_swing_and_no_farther(waveform):
-    pulse = Pulse(SWING, waveform)
+    pulse = WallMotion(SWING, waveform)
     time = np.linspace(0.0, 3.0, 6001)
     level = np.array([pulse.level(t) for t in time])
     assert level[0] == 0.0
     assert level.min() == 0.0
     assert level.max() == pytest.approx(1.0, abs=1e-3)
     # After the rise it is the waveform, brought to 0 to 1.
-    later = time >= RISE
+    later = time >= RAMP_TIME
     wave = np.array([waveform(t) for t in time[later]])
     low, high = waveform.factor.min(), waveform.factor.max()
     np.testing.assert_allclose(level[later], (wave - low) / (high - low), rtol=1e-12)
@@ -210,7 +210,7 @@ def test_lists_hold_every_proxy_in_reach_wherever_the_wall_is(sim, level):
 def test_between_two_builds_no_proxy_comes_near_unseen(sim, monkeypatch):
     # From wide to narrow in 2 ms, by more than the skin, towards blood that rests.
     fast = Waveform(np.array([0.0, 2e-3, 4e-3]), np.array([0.0, 1.0, 0.0]))
-    monkeypatch.setattr(sim, "pulse", Pulse(SWING, fast))
+    monkeypatch.setattr(sim, "pulse", WallMotion(SWING, fast))
     monkeypatch.setattr(sim, "speed_limit", 1e3)
     assert 1.5 * sim.neighbors.skin < SWING
     # So far apart that they do not feel each other.
@@ -221,7 +221,7 @@ def test_between_two_builds_no_proxy_comes_near_unseen(sim, monkeypatch):
     alone = np.stack([away * np.cos(turn), away * np.sin(turn), z], axis=1)
     sim.place(alone, np.zeros_like(alone))
     sim.drive(0.0)
-    sim.time = RISE + 2e-3 - RISE % 4e-3
+    sim.time = RAMP_TIME + 2e-3 - RAMP_TIME % 4e-3
     sim._pulse_until(sim.time)
     assert sim.wall.level == pytest.approx(1.0)
     before, compared = sim.neighbors.builds, 0
@@ -268,13 +268,13 @@ def state_of(sim: Simulation) -> list[np.ndarray]:
 
 def test_a_run_goes_on_bitwise_from_the_middle_of_a_beat(sim):
     sim.advance_to(0.062)
-    kept = sim.snapshot()
+    kept = sim.save_state()
     controls = msgspec.json.decode(msgspec.json.encode(kept.controls))
     sim.advance_to(0.066)
     expected = state_of(sim)
     sim.reset()
     sim.advance_to(sim.time + 0.003)
-    sim.go_on_from(replace(kept, controls=controls))
+    sim.load_state(replace(kept, controls=controls))
     sim.advance_to(0.066)
     for a, b in zip(state_of(sim), expected, strict=True):
         assert a.tobytes() == b.tobytes()
@@ -347,7 +347,7 @@ def test_a_wall_that_cannot_pulse_is_refused(scene, tmp_path):
     assert "nowhere.csv: cannot read the waveform" in refusal(
         scene, pulse=SWING, waveform="nowhere.csv"
     )
-    assert read_pulse(change(scene, wall=None), read_vessel(scene)) is None
+    assert read_wall_motion(change(scene, wall=None), read_vessel(scene)) is None
 
 
 @pytest.mark.parametrize(
@@ -372,4 +372,4 @@ def test_a_wrong_table_is_refused_in_one_sentence(scene, table, said):
 def test_a_pulsing_scene_is_not_recorded_for_training(scene):
     still = {k: change(o, pressure=None) for k, o in scene.openings.items()}
     with pytest.raises(InputError, match="wall: pulses"):
-        Stage(change(scene, openings=still), read_vessel(scene), 0)
+        ReplaySimulation(change(scene, openings=still), read_vessel(scene), 0)

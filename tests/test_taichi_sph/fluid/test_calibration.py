@@ -19,7 +19,7 @@ from builders import (
     calibration,
     cubic_lattice,
     make_fluid,
-    model_of,
+    make_model,
     periodic,
     plane,
     precision,
@@ -81,7 +81,7 @@ def on_the_wall(fluid, shear: float = 0.0):
 
 
 def viscosity_in_order(stage, fluid) -> np.ndarray:
-    return stage.in_order(model_of(fluid).viscosity)
+    return stage.in_order(make_model(fluid).viscosity)
 
 
 def test_lattice_without_a_wall_has_rest_density():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from builders import DENSITY, number, precision
+from builders import DENSITY, float_dtype, precision
 from taichi_sph.fluid.equation_of_state import Tait
 
 C = 3.0
@@ -23,7 +23,7 @@ def evaluate(state: ti.template(), density: ti.types.ndarray(), pressure: ti.typ
 
 
 def pressures(state: Tait, densities) -> np.ndarray:
-    rho = np.asarray(densities, dtype=float).astype(number())
+    rho = np.asarray(densities, dtype=float).astype(float_dtype())
     p = np.zeros_like(rho)
     evaluate(state, rho, p)
     return p.astype(float)

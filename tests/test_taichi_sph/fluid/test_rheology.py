@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from builders import number, precision
+from builders import float_dtype, precision
 from reference import casson
-from taichi_sph.fluid.rheology import Casson, Newtonian, rheology_of
+from taichi_sph.fluid.rheology import Casson, Newtonian, make_rheology
 from taichi_sph.scene import CassonTable, NewtonianTable
 
 ETA, TAU_Y, N = 3.5e-3, 5e-3, 7.0
@@ -31,7 +31,7 @@ def evaluate(law: ti.template(), rate: ti.types.ndarray(), viscosity: ti.types.n
 
 
 def viscosities(law: Newtonian | Casson, rates) -> np.ndarray:
-    g = np.asarray(rates, dtype=float).astype(number())
+    g = np.asarray(rates, dtype=float).astype(float_dtype())
     viscosity = np.zeros_like(g)
     evaluate(law, g, viscosity)
     return viscosity
@@ -83,7 +83,7 @@ def test_casson_without_a_yield_stress_is_newtonian():
 
 
 def test_newtonian_viscosity_does_not_depend_on_the_shear_rate():
-    assert np.all(viscosities(Newtonian(ETA), [0.0, *RATES]) == np.asarray(ETA, number()))
+    assert np.all(viscosities(Newtonian(ETA), [0.0, *RATES]) == np.asarray(ETA, float_dtype()))
 
 
 def test_printed_form_is_thin_at_rest_and_thickest_at_a_low_shear_rate():
@@ -103,6 +103,6 @@ def test_viscosity_is_a_number_at_rest_and_at_any_rate(n, printed):
 
 
 def test_scene_tables_become_the_laws_they_name():
-    assert rheology_of(NewtonianTable(viscosity=4e-3)) == Newtonian(4e-3)
+    assert make_rheology(NewtonianTable(viscosity=4e-3)) == Newtonian(4e-3)
     table = CassonTable(viscosity=3e-3, yield_stress=6e-3, regularisation=9.0, printed=True)
-    assert rheology_of(table) == Casson(3e-3, 6e-3, 9.0, printed=True)
+    assert make_rheology(table) == Casson(3e-3, 6e-3, 9.0, printed=True)

@@ -12,12 +12,12 @@ from builders import (
     SPHERE,
     D,
     R,
-    Stage,
+    Setup,
     ball,
     calibration,
     jittered_lattice,
     make_fluid,
-    model_of,
+    make_model,
     periodic,
     plane,
     precision,
@@ -63,7 +63,7 @@ def velocities(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     return np.roll(50.0 * x, 1, axis=1) + 0.03 * generator.normal(size=x.shape)
 
 
-def near_the_wall(seed: int) -> Stage:
+def near_the_wall(seed: int) -> Setup:
     """Blood that fills the round vessel up to a fifth of a spacing from its wall."""
     generator = np.random.default_rng(seed)
     x = ball(generator, SPHERE - 0.2 * D)
@@ -72,7 +72,7 @@ def near_the_wall(seed: int) -> Stage:
     return stage
 
 
-def lone_drops(seed: int) -> Stage:
+def lone_drops(seed: int) -> Setup:
     """Drops near the round wall that do not reach each other: they feel the wall alone."""
     generator = np.random.default_rng(seed)
     directions = np.concatenate([np.eye(3), -np.eye(3)])
@@ -83,7 +83,7 @@ def lone_drops(seed: int) -> Stage:
     return stage
 
 
-def filled_box(seed: int) -> Stage:
+def filled_box(seed: int) -> Setup:
     generator = np.random.default_rng(seed)
     x = jittered_lattice(generator)
     stage = periodic()
@@ -177,7 +177,7 @@ def test_the_walls_friction_is_along_the_velocity_and_against_it():
 def test_viscosity_is_cassons_of_the_shear_rate(place, fluid):
     stage = PLACES[place](8)
     stage.accelerate(fluid)
-    found = stage.in_order(model_of(fluid).viscosity)
+    found = stage.in_order(make_model(fluid).viscosity)
     expected = stage.reference(fluid).viscosity(nested=fluid.nested)
     assert expected.max() > 1.01 * expected.min()
     assert_close(found, expected, SUMS[precision()] + SERIES)
@@ -263,7 +263,7 @@ def test_blood_in_a_moving_train_accelerates_alike(fluid):
     assert_close(stage.accelerate(fluid), at_rest, FRAME[precision()])
 
 
-def transformed(stage: Stage, turn: np.ndarray, shift: np.ndarray, fluid) -> np.ndarray:
+def transformed(stage: Setup, turn: np.ndarray, shift: np.ndarray, fluid) -> np.ndarray:
     """Accelerations of the blood and the wall, both turned and shifted; the wall is put back."""
     p = stage.particles
     x, v = stage.in_order(p.position), stage.in_order(p.velocity)
@@ -311,7 +311,7 @@ def test_accelerating_changes_neither_positions_nor_velocities_nor_the_wall(flui
     p, w = stage.particles, stage.wall
     fields = (p.position, p.velocity, p.identity, w.position, w.normal, w.volume)
     before = [f.to_numpy() for f in fields]
-    model_of(fluid).accelerate(p, w, stage.neighbors, GRAVITY)
+    make_model(fluid).accelerate(p, w, stage.neighbors, GRAVITY)
     for field, values in zip(fields, before, strict=True):
         np.testing.assert_array_equal(field.to_numpy(), values)
 

@@ -429,7 +429,7 @@ def test_proxies_are_even_set_back_and_of_the_right_number(aorta: Vessel, ratio:
 
 def test_gaps_are_what_an_independent_search_finds(aorta: Vessel) -> None:
     spacing = 1e-3
-    points, nearest = wall_sampling.even_points(aorta.vertices, aorta.wall_faces, spacing, 0)
+    points, nearest = wall_sampling.relaxed_points(aorta.vertices, aorta.wall_faces, spacing, 0)
     corners = aorta.vertices[aorta.wall_faces[nearest]]
     normal = mesh.unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     assert np.abs(np.einsum("ij,ij->i", points - corners[:, 0], normal)).max() < 1e-9
@@ -438,8 +438,10 @@ def test_gaps_are_what_an_independent_search_finds(aorta: Vessel) -> None:
     )
     gap = np.sqrt(((probes[:, None] - points[None, ::40]) ** 2).sum(axis=2)).min(axis=1)
     assert gap.max() > 2 * spacing  # every 40th point leaves holes: the measure sees them
-    figures = wall_sampling.evenness(points, aorta.vertices, aorta.wall_faces, spacing)
-    thinned = wall_sampling.evenness(points[::2], aorta.vertices, aorta.wall_faces, spacing)
+    figures = wall_sampling.spacing_statistics(points, aorta.vertices, aorta.wall_faces, spacing)
+    thinned = wall_sampling.spacing_statistics(
+        points[::2], aorta.vertices, aorta.wall_faces, spacing
+    )
     assert thinned[3] > 1.0 > figures[3]
 
 
@@ -478,7 +480,7 @@ def test_the_cache_gives_the_same_points_and_survives_damage(
     first = pipe().sample_wall(1e-3, 0.5e-3)
     (file,) = own_cache.iterdir()
     calls = []
-    real = wall_sampling.even_points
+    real = wall_sampling.relaxed_points
 
     def counted(*given):
         calls.append(given)

@@ -12,11 +12,11 @@ from builders import (
     SPHERE,
     D,
     R,
-    Stage,
+    Setup,
     ball,
+    float_dtype,
     jittered_lattice,
     make_fluid,
-    number,
     periodic,
     plane,
     precision,
@@ -37,13 +37,13 @@ BLOOD = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), alpha=0.05, background=50
 STAGES = {"periodic": periodic, "plane": plane, "sphere": sphere}
 
 
-def corners(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+def corners(stage: Setup) -> tuple[np.ndarray, np.ndarray]:
     grid = stage.neighbors.grid
     lower = np.array(grid.lower)
     return lower, lower + np.array(grid.cell) * np.array(grid.shape)
 
 
-def cloud(stage: Stage, generator: np.random.Generator) -> np.ndarray:
+def cloud(stage: Setup, generator: np.random.Generator) -> np.ndarray:
     """Random points, points on cell faces, edges and corners, points on the box, (n, 3)."""
     lower, upper = corners(stage)
     middle = np.clip(0.5 * (lower + upper), lower, lower + 6 * D)
@@ -57,12 +57,12 @@ def cloud(stage: Stage, generator: np.random.Generator) -> np.ndarray:
     on_faces[some] = snapped[some]
     ends = np.array(list(itertools.product(*zip(lower, np.nextafter(upper, lower), strict=True))))
     beside = ends + generator.uniform(0.0, 0.5 * D, ends.shape) * np.sign(middle - ends)
-    x = np.concatenate([free, on_faces, ends, beside]).astype(number()).astype(float)
+    x = np.concatenate([free, on_faces, ends, beside]).astype(float_dtype()).astype(float)
     # A coordinate that f32 rounds up to the end of a period belongs to its beginning.
     return np.where((stage.period > 0) & (x >= upper), lower, x)
 
 
-def matrices(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+def matrices(stage: Setup) -> tuple[np.ndarray, np.ndarray]:
     """Lists as truth tables over rows, (n, n) and (n, m); an entry given twice is refused."""
     nb = stage.neighbors
     n = stage.particles.count[None]
@@ -80,7 +80,7 @@ def matrices(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     return tables[0], tables[1]
 
 
-def distances(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+def distances(stage: Setup) -> tuple[np.ndarray, np.ndarray]:
     """Distances between rows and from rows to proxies; infinite from a row to itself [m]."""
     n = stage.particles.count[None]
     x = stage.particles.position.to_numpy()[:n].astype(float)
@@ -90,7 +90,7 @@ def distances(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     return blood, np.linalg.norm(separations(x, y, stage.period), axis=-1)
 
 
-def assert_lists_are_brute_force(stage: Stage) -> None:
+def assert_lists_are_brute_force(stage: Setup) -> None:
     for listed, distance in zip(matrices(stage), distances(stage), strict=True):
         certain = np.abs(distance / REACH - 1.0) > ROUNDING[precision()]
         np.testing.assert_array_equal(listed[certain], (distance < REACH)[certain])
@@ -143,7 +143,7 @@ def test_cells_away_from_the_vessel_change_no_list():
     stage.neighbors.sort_wall(stage.wall)
 
 
-def by_identity(stage: Stage, neighbors: Neighbors) -> list[list[int]]:
+def by_identity(stage: Setup, neighbors: Neighbors) -> list[list[int]]:
     """Identities on each particle's list, by identity."""
     n = stage.particles.count[None]
     name = stage.particles.identity.to_numpy()[:n]
@@ -196,7 +196,7 @@ def test_lists_name_all_within_reach_when_all_have_moved_just_under_half_the_ski
     stage.put(x)
     stage.build()
     names = stage.particles.identity.to_numpy()[: len(x)]
-    moved = np.zeros((CAPACITY, 3), number())
+    moved = np.zeros((CAPACITY, 3), float_dtype())
     moved[: len(x)] = (x + step)[names]
     stage.particles.position.from_numpy(moved)
     for listed, distance in zip(matrices(stage), distances(stage), strict=True):
@@ -217,10 +217,10 @@ def test_removed_particles_vanish_and_the_rest_keep_state_and_lists():
     assert stage.particles.count[None] == 210
     np.testing.assert_array_equal(stage.particles.identities(), kept)
     np.testing.assert_array_equal(
-        stage.in_order(stage.particles.position), x[kept].astype(number())
+        stage.in_order(stage.particles.position), x[kept].astype(float_dtype())
     )
     np.testing.assert_array_equal(
-        stage.in_order(stage.particles.velocity), v[kept].astype(number())
+        stage.in_order(stage.particles.velocity), v[kept].astype(float_dtype())
     )
     assert_lists_are_brute_force(stage)
 

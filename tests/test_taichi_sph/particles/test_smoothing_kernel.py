@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from builders import KERNEL, R, number, precision
+from builders import KERNEL, R, float_dtype, precision
 from reference import wendland, wendland_gradient
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 
@@ -29,7 +29,7 @@ def evaluate(
 
 
 def compiled(kernel: WendlandC2, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r = radii.astype(number())
+    r = radii.astype(float_dtype())
     w, slope = np.zeros_like(r), np.zeros_like(r)
     evaluate(kernel, r, w, slope)
     return w, slope
