@@ -13,14 +13,8 @@ import numpy as np
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.mesh import Floats, Integers
-from taichi_sph.geometry.openings import (
-    Candidate,
-    find_openings,
-    is_round,
-    load_surface,
-    require_manifold,
-    where,
-)
+from taichi_sph.geometry.openings import Candidate, find_openings, is_round
+from taichi_sph.geometry.surface_file import load_surface, require_manifold, where
 from taichi_sph.geometry.vessel import (
     LARGEST,
     SMALLEST,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import wall_sampling
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers, NearestPoint, clean, is_closed
-from taichi_sph.geometry.openings import load_surface, require_manifold, require_outward
+from taichi_sph.geometry.surface_file import load_surface, require_manifold, require_outward
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall, proxy_volumes

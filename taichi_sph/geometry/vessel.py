@@ -17,11 +17,8 @@ from taichi_sph.geometry import clearance as passage
 from taichi_sph.geometry import filling, mesh, wall_sampling
 from taichi_sph.geometry.interior import Interior
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
-from taichi_sph.geometry.openings import (
-    Candidate,
-    Opening,
-    find_openings,
-    is_round,
+from taichi_sph.geometry.openings import Candidate, Opening, find_openings, is_round
+from taichi_sph.geometry.surface_file import (
     load_surface,
     require_manifold,
     require_outward,

@@ -12,7 +12,7 @@ from places import VESSELS
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.mesh import NearestPoint
-from taichi_sph.geometry.openings import load_surface
+from taichi_sph.geometry.surface_file import load_surface
 
 NAMES = sorted(path.parent.name for path in VESSELS.glob("*/centreline.json"))
 MEASURED = ["aortoiliac", "basilar_bifurcation", "carotid_siphon", "portal_vein"]

@@ -11,7 +11,7 @@ from meshes import LENGTH, RADIUS, cylinder
 from places import SHARED
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
-from taichi_sph.geometry.openings import load_surface
+from taichi_sph.geometry.surface_file import load_surface
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.scene import Scene, read_scene
 
