@@ -1,19 +1,20 @@
 """A user's own surface, capped or open, made into a scene folder: `vesselflow new my.stl`."""
 
-import json
 import math
-import os
-import shutil
-import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import igl
+import msgspec
 import numpy as np
 
+from app.scenes.assumptions import choose_column, choose_gravity
+from app.scenes.scene_folder import publish, readme_text, scene_text
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
+from taichi_sph.geometry.caps import BULGE
 from taichi_sph.geometry.mesh import Floats, Integers
-from taichi_sph.geometry.openings import Candidate, find_openings, is_round
+from taichi_sph.geometry.openings import Ends, close_holes, find_openings
 from taichi_sph.geometry.surface_file import load_surface, require_manifold, where
 from taichi_sph.geometry.vessel import (
     LARGEST,
@@ -21,17 +22,8 @@ from taichi_sph.geometry.vessel import (
     Vessel,
     build_vessel,
     crossings,
-    read_vessel,
 )
-from taichi_sph.scene import Column, OpeningTable, parse_scene
-
-ACROSS, LEAST = 8.0, 6.0
-"""Particles across the narrowest place that a new scene aims at, and makes do with."""
-FEWEST, MOST = 3000, 6000
-"""Blood particles that a new scene aims at."""
-
-DEEP = 2.5
-"""Depth of a new scene's column, over its opening's radius."""
+from taichi_sph.scene import OpeningTable
 
 
 def create_scene(
@@ -61,10 +53,11 @@ def create_scene(
     notes: list[str] = []
     scale = _guess_scale(vertices, scale, path, notes)
     vertices, faces = _tidy(vertices * scale, faces, str(path), notes)
-    vertices, faces, found = _openings(vertices, faces, str(path), notes)
+    ends = _openings(vertices, faces, str(path), scale, notes)
+    vertices, faces = ends.vertices, ends.faces
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     vertices = vertices - middle
-    places = {f"opening_{k}": c.centre - middle for k, c in enumerate(found, 1)}
+    places = {f"opening_{k}": c.centre - middle for k, c in enumerate(ends.found, 1)}
     notes.append(
         f"moved: the middle of the bounding box, {where(middle / scale)} in the file, is now 0"
     )
@@ -75,13 +68,17 @@ def create_scene(
     # Single precision is what the file will hold.
     vertices = vertices.astype(np.float32).astype(np.float64)
     vessel = build_vessel(vertices, faces, tables, 1.0, str(path))
-    _describe(vessel, notes)
-    gravity = _gravity(vessel, notes)
-    step, height = _column(vessel, spacing, notes)
+    _describe(vessel, ends, middle, notes)
+    gravity = choose_gravity(vessel, notes)
+    vessel, step, height = choose_column(vessel, spacing, notes)
+    tables = {
+        o.name: msgspec.structs.replace(tables[o.name], state="open" if o.is_open else "capped")
+        for o in vessel.openings
+    }
     title = path.stem.encode("utf-8", "replace").decode()
-    text = _scene_text(title, tables, gravity, step, height)
-    readme = _readme(title, path.name.encode("utf-8", "replace").decode(), notes)
-    _publish(folder, vertices, faces, text, readme)
+    text = scene_text(title, tables, gravity, step, height)
+    readme = readme_text(title, path.name.encode("utf-8", "replace").decode(), notes)
+    publish(folder, vertices, faces, text, readme)
     return "\n".join([f"{folder}: new scene", *(f"  {note}" for note in notes)])
 
 
@@ -136,155 +133,79 @@ def _tidy(
 
 
 def _openings(
-    vertices: Floats, faces: Integers, label: str, notes: list[str]
-) -> tuple[Floats, Integers, list[Candidate]]:
-    """The closed surface, outward, and its openings, the largest first."""
-    vertices, faces, found = find_openings(vertices, faces, label)
-    if mesh.enclosed_volume(vertices, faces) < 0:
-        vertices, faces, found = find_openings(
-            vertices, np.ascontiguousarray(faces[:, ::-1]), label
-        )
+    vertices: Floats, faces: Integers, label: str, scale: float, notes: list[str]
+) -> Ends:
+    """The closed surface, outward, and its openings, the largest first.
+
+    Raises:
+        InputError: there are fewer than two, or an end bulges.
+    """
+    closed, closed_faces, _ = close_holes(vertices, faces, label, scale)
+    if mesh.enclosed_volume(closed, closed_faces) < 0:
+        faces = np.ascontiguousarray(faces[:, ::-1])
         notes.append("normals: pointed inwards; turned round")
+    ends = find_openings(vertices, faces, label, scale, blunt=True)
+    for cap in ends.doubtful:
+        if cap.bulge > BULGE:
+            raise InputError(
+                f"{label}: the end at {where(cap.centre / scale)} in units of the file is no cut "
+                f"through a vessel: {cap.what_is_wrong} are allowed; cut it flat or leave it open"
+            )
+    if len(ends.found) < 2:
+        raise InputError(f"{label}: {_too_few(ends, scale)}")
+    found = sorted(ends.found, key=lambda c: (-c.area, *c.centre.tolist()))
     open_ends = sum(c.from_hole for c in found)
-    # A flat piece of wall is seldom as round as a cut through a vessel; an oblique cut is oval.
-    found = [c for c in found if c.from_hole or is_round(vertices, faces[c.faces], 0.6)]
-    largest = max((c.area for c in found), default=0.0)
-    found = sorted(
-        (c for c in found if c.from_hole or c.area > 0.01 * largest),
-        key=lambda c: (-c.area, *c.centre.tolist()),
-    )
-    if not found:
-        raise InputError(
-            f"{label}: no opening found; allowed: a surface with holes at its ends, or with flat "
-            "caps that meet the wall at an edge"
-        )
     if open_ends:
         notes.append(f"capped: {open_ends} open ends, flat")
-    return vertices, faces, found
+    uneven = [c.bulge for c in found if c.bulge > 0.0]
+    if uneven:
+        notes.append(
+            f"made flat: {len(uneven)} caps, which stood off their rims' planes by "
+            f"{100 * max(uneven):.2g} % of the radius at most"
+        )
+    return replace(ends, found=found)
 
 
-def _describe(vessel: Vessel, notes: list[str]) -> None:
+def _too_few(ends: Ends, scale: float) -> str:
+    """What is said of a surface with one opening or none."""
+    blind = "; ".join(where(tip.place / scale) for tip in ends.blind[:8])
+    others = "; ".join(
+        f"{where(cap.centre / scale)} ({cap.what_is_wrong})" for cap in ends.doubtful[:8]
+    )
+    text = "no opening found"
+    if ends.found:
+        text = f"only one opening found, at {where(ends.found[0].centre / scale)}"
+    if blind:
+        text += f"; closed and rounded off: {blind}"
+    if others:
+        text += f"; not taken: {others}"
+    return (
+        f"{text}; places are in units of the file; allowed: two or more ends that are open, or "
+        "have flat caps that meet the wall at an edge"
+    )
+
+
+def _millimetres(place: Floats) -> str:
+    """A place [m] as text in millimetres, to a tenth of a micrometre."""
+    return where(np.round(1e3 * place, 4) + 0.0)
+
+
+def _describe(vessel: Vessel, ends: Ends, middle: Floats, notes: list[str]) -> None:
     notes.append(f"lumen: {vessel.volume * 1e6:.4g} ml, {len(vessel.faces)} triangles, closed")
     crossed = crossings(vessel)
     notes.append(crossed.text if crossed.good else f"warning: {crossed.text}; blood may leak there")
     for opening in vessel.openings:
         notes.append(
-            f"{opening.name}: at {where(1e3 * opening.centre)} mm, radius "
+            f"{opening.name}: at {_millimetres(opening.centre)} mm, radius "
             f"{1e3 * opening.radius:.3g} mm; assumed open"
         )
-
-
-def _gravity(vessel: Vessel, notes: list[str]) -> Floats:
-    """From the largest opening towards the others [m/s^2], (3,)."""
-    top, *others = vessel.openings
-    if others:
-        along = mesh.unit(np.mean([o.centre for o in others], axis=0) - top.centre)
-        notes.append("gravity: assumed along from opening_1 towards the others")
-    else:
-        along = -top.normal
-        notes.append("gravity: assumed straight into opening_1, the only one")
-    return 9.81 * along
-
-
-def _round_down(value: float) -> float:
-    """Two significant digits."""
-    digits = 1 - math.floor(math.log10(value))
-    return float(f"{math.floor(value * 10**digits + 1e-9) / 10**digits:.12g}")
-
-
-def _column(vessel: Vessel, spacing: float | None, notes: list[str]) -> tuple[float, float]:
-    """Spacing and height of the blood column [m]."""
-    top = vessel.openings[0]
-    if spacing is None:
-        spacing = vessel.narrowest / ACROSS
-        # A wide opening above a narrow way: coarser, or the column would be a mere film; a vessel
-        # without narrow places: finer, or it would be a handful of particles.
-        coarse = (0.9 * top.area * 2.0 * top.radius / MOST) ** (1 / 3)
-        fine = (0.9 * top.area * DEEP * top.radius / FEWEST) ** (1 / 3)
-        spacing = min(max(spacing, coarse), vessel.narrowest / LEAST, fine)
-        spacing = _round_down(spacing)
-        reason = "chosen"
-    else:
-        reason = "as given"
-    vessel.require_resolution(spacing)
-    across = vessel.narrowest / spacing
-    notes.append(
-        f"spacing: {1e3 * spacing:.3g} mm, {reason}: {across:.1f} particles across the narrowest "
-        f"place ({1e3 * vessel.narrowest:.3g} mm)"
-    )
-    # As deep as a little over the opening is wide, within the bounds; at any rate one radius.
-    radius_deep = 0.9 * top.area * top.radius / spacing**3
-    wanted = round(max(min(DEEP * radius_deep, MOST), FEWEST, radius_deep))
-    while True:
-        try:
-            blood = vessel.fill_column(Column(opening=top.name, particles=wanted), spacing)
-            break
-        except InputError:
-            if wanted < 100:
-                raise
-            wanted //= 2
-    depth = float(((top.centre - blood) @ top.normal).max()) + 0.5 * spacing
-    layers = max(1, round(depth / spacing))
-    height = float(f"{layers * spacing:.6g}")
-    blood = vessel.fill_column(Column(opening=top.name, height=height), spacing)
-    notes.append(
-        f"column: {len(blood)} blood particles, {1e3 * height:.3g} mm deep, at {top.name}, the "
-        "largest"
-    )
-    return spacing, height
-
-
-def _numbers(values: Floats | tuple[float, ...], digits: int) -> str:
-    return "[" + ", ".join(f"{value:.{digits}f}" for value in values) + "]"
-
-
-def _scene_text(
-    title: str, tables: dict[str, OpeningTable], gravity: Floats, spacing: float, height: float
-) -> str:
-    lines = [
-        "# SI units.  Made by `vesselflow new`; README.md says what it assumed.",
-        f"title = {json.dumps(title, ensure_ascii=False)}",
-        "duration = 0.5          # [s]",
-        "frame_interval = 0.005  # [s]",
-        f"gravity = {_numbers(gravity, 4)}  # [m/s^2]",
-        "",
-        "[vessel]",
-        'surface = "lumen.ply"',
-        "scale = 1.0             # metres per unit of the file",
-    ]
-    for name, table in tables.items():
-        lines += ["", f"[openings.{name}]", f"centre = {_numbers(table.centre, 7)}"]
-        lines += ['state = "open"           # or "capped"']
-    lines += ["", "[column]", 'opening = "opening_1"', f"height = {height:.6g}  # [m]"]
-    lines += ["", "[blood]", "density = 1060.0        # [kg/m^3]"]
-    lines += ['rheology = { model = "casson" }']
-    lines += ["", "[discretization]", f"spacing = {spacing:.6g}  # [m]"]
-    return "\n".join(lines) + "\n"
-
-
-def _readme(title: str, source: str, notes: list[str]) -> str:
-    lines = [f"# {title}", "", f"Made by `vesselflow new` from `{source}`.  The surface is that"]
-    lines += ["file's, in metres; its source and licence are for you to note here.", ""]
-    return "\n".join([*lines, "Found and assumed:", "", *(f"- {note}" for note in notes)]) + "\n"
-
-
-def _publish(folder: Path, vertices: Floats, faces: Integers, text: str, readme: str) -> None:
-    """Write the files beside their place, read them back, then move the folder there at once."""
-    temporary = None
-    try:
-        parent = folder.absolute().parent
-        temporary = Path(tempfile.mkdtemp(prefix=".vesselflow-", dir=parent))
-        mesh.write_ply(temporary / "lumen.ply", vertices, faces, "lumen, metres")
-        (temporary / "scene.toml").write_text(text, encoding="utf-8")
-        (temporary / "README.md").write_text(readme, encoding="utf-8")
-        read_vessel(parse_scene(text, str(folder / "scene.toml"), temporary, folder.name))
-        temporary.chmod(0o755)
-        os.rename(temporary, folder)
-        temporary = None
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot make the scene folder: {error.strerror or error}"
-        ) from None
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+    for cap in ends.doubtful:
+        notes.append(
+            f"flat end not taken: at {_millimetres(cap.centre - middle)} mm, radius "
+            f"{1e3 * cap.radius:.3g} mm: {cap.what_is_wrong}; it is wall"
+        )
+    for tip in ends.blind:
+        notes.append(
+            f"blind end: at {_millimetres(tip.place - middle)} mm, radius "
+            f"{1e3 * tip.radius:.3g} mm, closed and rounded off: it is wall"
+        )

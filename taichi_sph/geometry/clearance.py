@@ -22,13 +22,13 @@ End = tuple[Floats, Floats, float]
 """Centre, outward unit normal and radius of an opening."""
 
 
-def narrowest_radius(
+def narrowest_place(
     vertices: Floats,
     faces: Integers,
     wall: Integers,
     ends: list[End],
     contains: Callable[[Floats], Booleans],
-) -> float:
+) -> tuple[float, int]:
     """Radius of the largest ball that passes from the first opening to all others.
 
     A path along the middle is found on a coarse lattice; at each of its stations, and in the
@@ -40,6 +40,9 @@ def narrowest_radius(
         wall: Triangles without the openings' caps (w, 3).
         ends: The openings.
         contains: Which points (k, 3) lie within the lumen.
+
+    Returns:
+        The radius, and the number of the opening that it is in or on the way to.
     """
     nearest_on = NearestPoint(vertices, wall)
 
@@ -49,7 +52,7 @@ def narrowest_radius(
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = min([radius for _, _, radius in ends], default=float((high - low).min()) / 2) / 3
     area = float(np.linalg.norm(face_vectors(vertices, faces), axis=1).sum())
-    least = np.inf
+    least, narrow_end = np.inf, 0
     for _ in range(3):
         size = max(size, float(np.prod(high - low) / 2e6) ** (1 / 3))
         shape = np.ceil((high - low) / size).astype(int)
@@ -60,27 +63,30 @@ def narrowest_radius(
         if len(places) == 0:
             size /= 2
             continue
-        room = clearance(places)
+        clearances = clearance(places)
         if not ends:
-            best = places[np.argsort(room)[-20:]]
-            return float(_widen(best, np.zeros_like(best), size, clearance).max())
-        doors = [np.array(part) for part in zip(*ends, strict=True)]
-        least = float(_widen(doors[0], doors[1], 0.5 * doors[2], clearance).min())
-        paths = _paths(inside, places, room, ends, size)
+            best = places[np.argsort(clearances)[-20:]]
+            widest = maximise_clearance(best, np.zeros_like(best), size, clearance)
+            return float(widest.max()), 0
+        centres, normals, radii = (np.array(part) for part in zip(*ends, strict=True))
+        at_ends = maximise_clearance(centres, normals, 0.5 * radii, clearance)
+        least, narrow_end = float(at_ends.min()), int(at_ends.argmin())
+        paths = _paths(inside, places, clearances, ends, size)
         if paths is not None:
-            for points, tangents in paths:
+            for end, points, tangents in paths:
                 # From the tightest on; a station roomier than the least so far cannot matter.
                 before = clearance(points)
                 for some in np.array_split(np.argsort(before), max(1, len(points) // 10)):
                     some = some[before[some] < least]
                     if len(some) == 0:
                         break
-                    widest = _widen(points[some], tangents[some], size, clearance)
-                    least = min(least, float(widest.min()))
-            return least
+                    widest = maximise_clearance(points[some], tangents[some], size, clearance)
+                    if widest.min() < least:
+                        least, narrow_end = float(widest.min()), end
+            return least, narrow_end
         size /= 2
     # Closed but for a gap finer than the lattice.
-    return min(least, size)
+    return min(least, size), narrow_end
 
 
 def _inside_cells(
@@ -102,9 +108,12 @@ def _inside_cells(
 
 
 def _paths(
-    inside: Booleans, places: Floats, room: Floats, ends: list[End], size: float
-) -> list[tuple[Floats, Floats]] | None:
-    """Points and directions of the way from the first end to each other; None where cut off."""
+    inside: Booleans, places: Floats, clearances: Floats, ends: list[End], size: float
+) -> list[tuple[int, Floats, Floats]] | None:
+    """Number, points and directions of the way from the first end to each other.
+
+    None where one is cut off.
+    """
     number = np.full(inside.shape, -1)
     number[inside] = np.arange(len(places))
     rows, columns, weights = [], [], []
@@ -121,13 +130,13 @@ def _paths(
         rows.append(a)
         columns.append(b)
         # Dear where it is narrow, so that the way keeps to the middle.
-        tight = np.minimum(room[a], room[b]) + 0.05 * size
+        tight = np.minimum(clearances[a], clearances[b]) + 0.05 * size
         weights.append(float(np.linalg.norm(step)) * (size / tight) ** 3)
     graph = coo_matrix(
         (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
         shape=(len(places), len(places)),
     ).tocsr()
-    doors = []
+    end_cells = []
     for centre, normal, radius in ends:
         apart = places - centre
         near = np.linalg.norm(apart, axis=1) < 2.0 * radius
@@ -135,23 +144,23 @@ def _paths(
         if not near.any():
             return None
         members = np.flatnonzero(near)
-        doors.append(int(members[np.argmax(room[members])]))
-    cost, before = dijkstra(graph, directed=False, indices=doors[0], return_predecessors=True)
-    if not np.isfinite(cost[doors]).all():
+        end_cells.append(int(members[np.argmax(clearances[members])]))
+    cost, before = dijkstra(graph, directed=False, indices=end_cells[0], return_predecessors=True)
+    if not np.isfinite(cost[end_cells]).all():
         return None
     paths = []
-    for door in doors[1:]:
-        way = [door]
-        while way[-1] != doors[0]:
+    for end, cell in enumerate(end_cells[1:], 1):
+        way = [cell]
+        while way[-1] != end_cells[0]:
             way.append(int(before[way[-1]]))
         if len(way) < 3:
             continue
         points = ndimage.gaussian_filter1d(places[way], 1.5, axis=0, mode="nearest")
-        paths.append((points, unit(np.gradient(points, axis=0))))
+        paths.append((end, points, unit(np.gradient(points, axis=0))))
     return paths
 
 
-def _widen(
+def maximise_clearance(
     points: Floats,
     normals: Floats,
     reach: float | Floats,
@@ -170,8 +179,8 @@ def _widen(
     rows = np.arange(len(points))
     for _ in range(4):
         tries = points[:, None] + offsets
-        room = clearance(tries.reshape(-1, 3)).reshape(tries.shape[:2])
-        chosen = room.argmax(axis=1)
+        found = clearance(tries.reshape(-1, 3)).reshape(tries.shape[:2])
+        chosen = found.argmax(axis=1)
         points = tries[rows, chosen]
         offsets = 0.35 * offsets
-    return room[rows, chosen]
+    return found[rows, chosen]

@@ -1,19 +1,31 @@
-"""Blood at the start: a cubic lattice of particles in the lumen behind an opening."""
+"""Blood at the start: a cubic lattice of particles in the lumen behind an opening.
+
+What belongs to the column is what hangs together with the opening inside the lumen, place by
+place: what merely lies beside it, in another branch, does not.
+"""
 
 import math
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
-from taichi_sph.geometry.mesh import Booleans, Floats
+from taichi_sph.geometry.mesh import Booleans, Floats, Integers, inside_polygon
 from taichi_sph.geometry.openings import Opening
 from taichi_sph.scene import Column
 
 _TOLERANCE = 1e-3
 """Slack of distances, over the spacing: surfaces are stored in single precision."""
+_BLOCKED = 0.05
+"""Half-way between two neighbours the wall is farther than this [spacings], or it is between them:
+each of them keeps half a spacing."""
+_TOP_LAYERS = 3
+"""Where the rim is oblique the first layers may hold no particle."""
 
 
 class Lumen(Protocol):
@@ -38,29 +50,77 @@ class Lumen(Protocol):
         """Distance of points (k, 3) to the surface [m]."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Lattice:
+    """Places behind an opening."""
+
+    allowed: Booleans
+    """Where particles may stand (layers, p, q)."""
+    points: Floats
+    """Positions (layers, p, q, 3) [m]."""
+    depth: Floats
+    """Of each layer (layers,) [m]."""
+    below_opening: Booleans
+    """Places straight below the opening, in the lumen all the way (top layers, p, q)."""
+    blocked: tuple[Booleans, ...]
+    """Per axis: neighbours (at a place and at the next along it) with a wall between them."""
+
+    def joined(self, layers: int) -> Booleans:
+        """The places of the first layers that hang together with the opening through others."""
+        allowed = self.allowed[:layers]
+        label = self._labels(layers)
+        for layer in range(min(_TOP_LAYERS, len(allowed))):
+            names = np.unique(label[layer][allowed[layer] & self.below_opening[layer]])
+            if len(names):
+                return np.asarray(np.isin(label, names))
+        return np.zeros_like(allowed)
+
+    def _labels(self, layers: int) -> Integers:
+        """Number of the connected part of every place; 0 where none may stand."""
+        allowed = self.allowed[:layers]
+        if not any(cut[:layers].any() for cut in self.blocked):
+            return np.asarray(ndimage.label(allowed)[0])
+        number = np.cumsum(allowed).reshape(allowed.shape) - 1
+        rows, columns = [], []
+        for axis, cut in enumerate(self.blocked):
+            here, there = _neighbours(allowed.ndim, axis)
+            joined = allowed[here] & allowed[there] & ~cut[:layers][here]
+            rows.append(number[here][joined])
+            columns.append(number[there][joined])
+        i, j = np.concatenate(rows), np.concatenate(columns)
+        count = int(allowed.sum())
+        graph = coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+        label = np.zeros(allowed.shape, np.int64)
+        label[allowed] = 1 + connected_components(graph, directed=False)[1]
+        return label
+
+
+def _neighbours(dimensions: int, axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Slices of all places that have a next one along an axis, and of those next ones."""
+    whole = [slice(None)] * dimensions
+    here, there = whole.copy(), whole.copy()
+    here[axis], there[axis] = slice(None, -1), slice(1, None)
+    return tuple(here), tuple(there)
+
+
 def _lattice(
-    lumen: Lumen, opening: Opening, spacing: float, offset: float, deepest: float
-) -> tuple[Booleans, Floats, Floats]:
+    lumen: Lumen, opening: Opening, rim: Floats, spacing: float, offset: float, deepest: float
+) -> _Lattice:
     """Cubic lattice behind an opening: where particles may stand.
 
     Args:
         lumen: The closed surface.
         opening: Layers are parallel to its plane.
+        rim: Closed polygon round it (n, 3) [m].
         spacing: Of the lattice [m].
         offset: A layer boundary lies this far below the plane [m].
         deepest: Layers go no deeper than this [m].
-
-    Returns:
-        Grid (layers, p, q) of allowed places, their positions (layers, p, q, 3) [m], and the
-        depth of each layer (layers,) [m].
     """
     first, second = mesh.plane_axes(opening.normal)
     apart = lumen.vertices - opening.centre
     lines = []
-    rim = apart[np.abs(apart @ opening.normal) < 1e-3 * opening.radius]
-    rim = rim[np.linalg.norm(rim, axis=1) < 3.0 * opening.radius]
     for axis in (first, second):
-        across, span = apart @ axis, rim @ axis
+        across, span = apart @ axis, (rim - opening.centre) @ axis
         # An even number of particles across straddles the middle, an odd one stands on it.
         middle = 0.5 * (span.min() + span.max())
         phase = 0.5 * (math.floor(np.ptp(span) / spacing + _TOLERANCE) % 2 == 0)
@@ -77,10 +137,49 @@ def _lattice(
     possible = _coarse(lumen, axes, directions, opening.centre, spacing)
     places = points[possible]
     allowed = lumen.contains(places)
-    allowed[allowed] = lumen.distance(places[allowed]) >= (0.5 - _TOLERANCE) * spacing
-    grid = np.zeros(points.shape[:3], bool)
-    grid[possible] = allowed
-    return grid, points, depth
+    clearance = np.zeros(points.shape[:3])
+    clearance[possible] = np.where(allowed, _distances(lumen, places, allowed), 0.0)
+    grid = clearance >= (0.5 - _TOLERANCE) * spacing
+    top = grid[:_TOP_LAYERS].copy()
+    top[top] = _below(lumen, opening, rim, points[:_TOP_LAYERS][top])
+    cuts = tuple(_blocked(lumen, grid, points, clearance, axis, spacing) for axis in range(3))
+    return _Lattice(grid, points, depth, top, cuts)
+
+
+def _distances(lumen: Lumen, places: Floats, wanted: Booleans) -> Floats:
+    """Distances to the surface [m] of the wanted places (k, 3); 0 for the others, (k,)."""
+    result = np.zeros(len(places))
+    result[wanted] = lumen.distance(places[wanted])
+    return result
+
+
+def _below(lumen: Lumen, opening: Opening, rim: Floats, places: Floats) -> Booleans:
+    """Which places (k, 3) lie straight below an opening, and in the lumen all the way up to it."""
+    first, second = mesh.plane_axes(opening.normal)
+    axes = np.stack([first, second], axis=1)
+    result = inside_polygon((places - opening.centre) @ axes, (rim - opening.centre) @ axes)
+    height = (places - opening.centre) @ opening.normal
+    for share in (0.25, 0.5, 0.75):
+        result[result] = lumen.contains(
+            places[result] - share * height[result, None] * opening.normal
+        )
+    return result
+
+
+def _blocked(
+    lumen: Lumen, grid: Booleans, points: Floats, clearance: Floats, axis: int, spacing: float
+) -> Booleans:
+    """Places whose next one along an axis is beyond a wall: two lumens may all but touch."""
+    here, there = _neighbours(grid.ndim, axis)
+    near = grid[here] & grid[there]
+    near &= clearance[here] + clearance[there] < (1.0 + 2.0 * _TOLERANCE) * spacing
+    middle = 0.5 * (points[here][near] + points[there][near])
+    between = lumen.distance(middle) < _BLOCKED * spacing
+    between |= ~lumen.contains(middle)
+    result = np.zeros_like(grid)
+    part = result[here]
+    part[near] = between
+    return result
 
 
 def _places(axes: tuple[Floats, ...], directions: tuple[Floats, ...]) -> Floats:
@@ -111,15 +210,18 @@ def _coarse(
     return result
 
 
-def fill_column(lumen: Lumen, opening: Opening, column: Column, spacing: float) -> Floats:
+def fill_column(
+    lumen: Lumen, opening: Opening, rim: Floats, column: Column, spacing: float
+) -> Floats:
     """Blood at the start: a cubic lattice that stands in the lumen behind an opening.
 
     Every particle is half a spacing or more from the surface and connected to the opening
-    through others; its depth is counted straight down from the opening's plane.
+    through others, inside the lumen; its depth is counted straight down from the opening's plane.
 
     Args:
         lumen: The closed surface.
         opening: Where the column stands.
+        rim: Closed polygon round it (m, 3) [m].
         column: How deep or how many.
         spacing: Distance between particles [m].
 
@@ -148,13 +250,15 @@ def fill_column(lumen: Lumen, opening: Opening, column: Column, spacing: float) 
         wanted = column.particles
         deepest = min(reach, offset + 1.25 * wanted * spacing**3 / opening.area + 2 * spacing)
         while True:
-            found = _connected(lumen, opening, spacing, offset, deepest, wanted)
+            found = _shallowest(lumen, opening, rim, spacing, offset, deepest, wanted)
             if found is not None:
                 return found
             if deepest >= reach:
                 break
             deepest = min(reach, offset + 1.6 * (deepest - offset))
-    grid, points, depth = _component(lumen, opening, spacing, offset, deepest)
+    lattice = _lattice(lumen, opening, rim, spacing, offset, deepest)
+    points, depth = lattice.points, lattice.depth
+    grid = lattice.joined(len(depth))
     count = int(grid[depth > offset].sum())
     if column.particles is not None:
         raise InputError(
@@ -187,48 +291,24 @@ def fill_column(lumen: Lumen, opening: Opening, column: Column, spacing: float) 
     return points[layers][grid[layers]][::-1].copy()
 
 
-def _component(
-    lumen: Lumen, opening: Opening, spacing: float, offset: float, deepest: float
-) -> tuple[Booleans, Floats, Floats]:
-    """`_lattice` without the places that are not connected to the opening."""
-    grid, points, depth = _lattice(lumen, opening, spacing, offset, deepest)
-    if not len(depth):
-        return grid, points, depth
-    return _joined(grid, points, opening), points, depth
-
-
-def _joined(grid: Booleans, points: Floats, opening: Opening) -> Booleans:
-    """The part of a lattice that hangs together with its top layer below the opening."""
-    label, _ = ndimage.label(grid)
-    for layer in range(min(3, len(grid))):
-        # Where the rim is oblique the first layers may hold no particle.
-        apart = points[layer] - opening.centre
-        apart = apart + (-(apart @ opening.normal))[..., None] * opening.normal
-        near = grid[layer] & (np.linalg.norm(apart, axis=2) < 2.0 * opening.radius)
-        names = np.unique(label[layer][near])
-        if len(names):
-            return np.isin(label, names)
-    return np.zeros_like(grid)
-
-
-def _connected(
-    lumen: Lumen, opening: Opening, spacing: float, offset: float, deepest: float, wanted: int
-) -> Floats | None:
+def _shallowest(
+    lumen: Lumen, opening: Opening, rim: Floats, spacing: float, offset: float, deepest: float,
+    wanted: int,
+) -> Floats | None:  # fmt: skip
     """The `wanted` connected places of smallest depth (wanted, 3) [m], or None if fewer."""
-    grid, points, depth = _lattice(lumen, opening, spacing, offset, deepest)
-    first = int(np.searchsorted(depth, offset))
-    low, high = first, len(depth)
-    if _joined(grid, points, opening)[first:].sum() < wanted:
+    lattice = _lattice(lumen, opening, rim, spacing, offset, deepest)
+    first = int(np.searchsorted(lattice.depth, offset))
+    low, high = first, len(lattice.depth)
+    if lattice.joined(high)[first:].sum() < wanted:
         return None
     while low < high:  # least number of layers whose connected part is large enough
         middle = (low + high) // 2
-        if _joined(grid[:middle], points[:middle], opening)[first:].sum() >= wanted:
+        if lattice.joined(middle)[first:].sum() >= wanted:
             high = middle
         else:
             low = middle + 1
-    joined = _joined(grid[:low], points[:low], opening)
-    layer, row, column = np.nonzero(joined[first:])
-    chosen = points[first:low][layer, row, column]
+    layer, row, column = np.nonzero(lattice.joined(low)[first:])
+    chosen = lattice.points[first:low][layer, row, column]
     # In the last layer the places nearest to its middle stay.
     last = chosen[layer == layer.max()]
     aside = np.linalg.norm(chosen - last.mean(axis=0), axis=1)

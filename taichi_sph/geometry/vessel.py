@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_sph.errors import InputError
-from taichi_sph.geometry import clearance as passage
-from taichi_sph.geometry import filling, mesh, wall_sampling
+from taichi_sph.geometry import clearance, filling, mesh, wall_sampling
+from taichi_sph.geometry.caps import flat_part_at
 from taichi_sph.geometry.interior import Interior
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
-from taichi_sph.geometry.openings import Candidate, Opening, find_openings, is_round
+from taichi_sph.geometry.openings import (
+    Candidate,
+    Ends,
+    Opening,
+    close_holes,
+    find_openings,
+    is_round,
+)
 from taichi_sph.geometry.surface_file import (
     load_surface,
     require_manifold,
@@ -209,18 +216,30 @@ class Vessel:
         Raises:
             InputError: the column does not fit, or its opening is not there.
         """
-        return filling.fill_column(self, self.opening(column.opening), column, spacing)
+        opening = self.opening(column.opening)
+        rim = self.rim(self.openings.index(opening))
+        return filling.fill_column(self, opening, rim, column, spacing)
 
     @cached_property
+    def _narrowest_place(self) -> tuple[float, int]:
+        ends = [(o.centre, o.normal, o.radius) for o in self.openings if o.is_open]
+        return clearance.narrowest_place(
+            self.vertices, self._triangles, self.wall_faces, ends, self.contains
+        )
+
+    @property
     def narrowest(self) -> float:
         """Diameter of the largest ball that passes between the open openings [m].
 
         Blind side branches do not count.  With no opening open: of the largest ball that fits.
         """
-        ends = [(o.centre, o.normal, o.radius) for o in self.openings if o.is_open]
-        return 2.0 * passage.narrowest_radius(
-            self.vertices, self._triangles, self.wall_faces, ends, self.contains
-        )
+        return 2.0 * self._narrowest_place[0]
+
+    @property
+    def narrowest_opening(self) -> Opening | None:
+        """The open opening that the narrowest place is in or on the way to; None without one."""
+        ends = [o for o in self.openings if o.is_open]
+        return ends[self._narrowest_place[1]] if ends else None
 
     def require_resolution(self, spacing: float) -> None:
         """Refuse a spacing too coarse for the lumen.
@@ -231,9 +250,11 @@ class Vessel:
         across = self.narrowest / spacing
         most = 0.998 * self.narrowest / LEAST_ACROSS
         if across < LEAST_ACROSS:
+            opening = self.narrowest_opening
+            there = f" at opening {opening.name!r}" if opening is not None else ""
             raise InputError(
                 f"discretization.spacing: {spacing:g} m puts {across:.1f} particles across the "
-                f"narrowest place of {self.label} ({self.narrowest:.3g} m); at least "
+                f"narrowest place of {self.label} ({self.narrowest:.3g} m{there}); at least "
                 f"{LEAST_ACROSS:g} are needed: at most {most:.3g} m"
             )
 
@@ -267,15 +288,19 @@ def build_vessel(
     if len(faces) == 0:
         raise InputError(f"{label}: all triangles have collapsed to lines; a tube is needed")
     require_manifold(vertices, faces, label)
-    vertices, faces, found = find_openings(vertices, faces, label)
-    require_outward(vertices, faces, label)
-    matched = _match(openings, found, scale, label)
+    closed, closed_faces, _ = close_holes(vertices, faces, label, scale)
+    require_outward(closed, closed_faces, label)
+    ends = find_openings(vertices, faces, label, scale)
+    if any(not _near(ends, np.array(table.centre) * scale) for table in openings.values()):
+        ends = find_openings(vertices, faces, label, scale, blunt=True)
+    vertices, faces = ends.vertices, ends.faces
+    matched = _match(openings, ends, scale, label)
     face_opening = np.full(len(faces), -1, np.int32)
     named = []
     for index, (name, candidate) in enumerate(matched.items()):
         face_opening[candidate.faces] = index
         named.append(_opening(name, candidate, openings[name].state == "open"))
-    others = [c for c in found if all(c is not chosen for chosen in matched.values())]
+    others = [c for c in ends.found if all(c is not chosen for chosen in matched.values())]
     # Any flat wall looks like a cap; those listed as unnamed are rounder than a square.
     round_ones = [c for c in others if c.from_hole or is_round(vertices, faces[c.faces], 0.82)]
     unnamed = [_opening(f"unnamed_{k}", c, False) for k, c in enumerate(round_ones, 1)]
@@ -289,9 +314,9 @@ def _opening(name: str, found: Candidate, is_open: bool) -> Opening:
 
 
 def _match(
-    openings: dict[str, OpeningTable], found: list[Candidate], scale: float, label: str
+    openings: dict[str, OpeningTable], ends: Ends, scale: float, label: str
 ) -> dict[str, Candidate]:
-    """The flat end that each of the scene's openings means.
+    """The end that each of the scene's openings means.
 
     Raises:
         InputError: none is near, or two names mean the same.
@@ -299,22 +324,45 @@ def _match(
     matched: dict[str, Candidate] = {}
     for name, table in openings.items():
         point = np.array(table.centre) * scale
-        near = [c for c in found if np.linalg.norm(c.centre - point) < c.radius]
+        near = _near(ends, point) or _flat_there(ends, point)
         if not near:
-            places = "; ".join(where(c.centre / scale) for c in found[:8]) or "none"
             raise InputError(
                 f"openings.{name}: no opening of {label} is at {where(np.array(table.centre))}; "
-                f"found, in units of the file: {places}"
+                + _what_is_there(ends, point, scale)
             )
         chosen = min(near, key=lambda c: float(np.linalg.norm(c.centre - point)))
         for other, taken in matched.items():
-            if taken is chosen:
+            if taken is chosen or np.isin(chosen.faces, taken.faces).any():
                 raise InputError(
                     f"openings.{name}: the same opening of {label} as openings.{other}; "
                     "each name needs its own"
                 )
         matched[name] = chosen
     return matched
+
+
+def _near(ends: Ends, point: Floats) -> list[Candidate]:
+    """Ends that a scene's point (3,) may mean."""
+    return [c for c in ends.found if np.linalg.norm(c.centre - point) < c.radius]
+
+
+def _flat_there(ends: Ends, point: Floats) -> list[Candidate]:
+    """The flat disc that a scene points at, though its rim is too blunt to be found."""
+    members = flat_part_at(ends.vertices, ends.faces, point)
+    if len(members) == 0:
+        return []
+    plane = mesh.region_plane(ends.vertices, ends.faces[members])
+    disc = Candidate(*plane, members, from_hole=False)
+    return [disc] if np.linalg.norm(disc.centre - point) < 0.5 * disc.radius else []
+
+
+def _what_is_there(ends: Ends, point: Floats, scale: float) -> str:
+    """What a scene's opening that was not found may have meant."""
+    for cap in ends.doubtful:
+        if np.linalg.norm(cap.centre - point) < cap.radius:
+            return f"the end there is none: {cap.what_is_wrong}; cut it flat or leave it open"
+    places = "; ".join(where(c.centre / scale) for c in ends.found[:8]) or "none"
+    return f"found, in units of the file: {places}"
 
 
 def read_vessel(scene: Scene) -> Vessel:
