@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from rich.console import Console
 from rich.table import Table
@@ -154,6 +154,10 @@ def table(title: str, *headings: str, left: Collection[str] = ()) -> Table:
     return found
 
 
-def console() -> Console:
-    """Standard output; wide where it is no terminal, so that nothing is cut."""
-    return Console() if sys.stdout.isatty() else Console(width=160)
+def console(file: TextIO | None = None) -> Console:
+    """A terminal, stdout by default; wide where it is none, so that nothing is cut.
+
+    What it prints is never markup: a title or a path may have brackets and colons.
+    """
+    width = None if (file or sys.stdout).isatty() else 160
+    return Console(file=file, width=width, markup=False, emoji=False)

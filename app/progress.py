@@ -28,15 +28,15 @@ class Progress:
     def __init__(self, until: float, title: str, console: Console | None = None):
         """Show a run to a simulated time [s], which may be infinite."""
         self.until = until
-        self._console = console or Console(file=sys.stderr)
+        self._console = console or Console(file=sys.stderr, markup=False, emoji=False)
         self._reference: tuple[float, float] | None = None
         self._shown = -1e9
         self._bar: Bar | None = None
         if self._console.is_terminal:
             self._bar = Bar(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
-                TextColumn("{task.fields[state]}"),
+                TextColumn("{task.fields[state]}", markup=False),
                 TimeElapsedColumn(),
                 console=self._console,
             )
@@ -65,7 +65,7 @@ class Progress:
         if rate and ends:
             state += f", {duration((self.until - simulated) / rate)} left"
         if leaks:
-            state += f", {leaks} leaks"
+            state += f", {leaks} leak{'s' if leaks > 1 else ''}"
         if self._bar:
             self._bar.update(self._task, completed=simulated, state=state)
         elif now - self._shown >= LINE_EVERY and simulated < self.until:

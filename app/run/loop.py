@@ -53,6 +53,7 @@ class Summary:
     """At the last frame; `most_leaks` is the worst of all frames."""
     most_leaks: int
     wall_corrections: int
+    """One for each step of a particle that the wall's last defence has acted on."""
     compression_p99: float
     """99th percentile of max(rho/rho_0 - 1, 0) at the last frame."""
     most_compression_p99: float
@@ -62,6 +63,10 @@ class Summary:
     """Live at the end."""
     drained_volume: float
     """[m^3]"""
+    drained: dict[str, int]
+    """Particles that have left, by opening."""
+    added_volume: float
+    """Blood that pumps and reservoirs have added [m^3]."""
     fallback_share: float
     """Part of the simulated time in which the model fell back to the physics."""
     diverged: bool
@@ -155,7 +160,6 @@ def drive(
         the summary; with the error of a run that diverged or could not write its output, or the
         signal that ended it.
     """
-    scene, derived = simulation.scene, simulation.derived
     signals = _Signals()
     error: RunError | OSError | None = None
     stopped: int | None = None
@@ -208,27 +212,36 @@ def drive(
                 if error is None:
                     error, ending = caught, str(caught)
     wall_time = time.perf_counter() - began
-    summary = Summary(
-        scene=scene.name,
+    summary = _summary_of(
+        simulation, figures, step_times,
+        steps=steps, frames=frame, wall_time=wall_time,
+        real_time_factor=(figures.time - first_time) / wall_time,
+        most_leaks=most_leaks, most_compression_p99=most_compression,
+        diverged=isinstance(error, RunError), ending=ending,
+    )  # fmt: skip
+    return Outcome(summary, error, stopped)
+
+
+def _summary_of(
+    simulation: "Simulation", figures: "Diagnostics", step_times: list[float], **counted: Any
+) -> Summary:
+    """The summary of a run that stands at its last frame, with what its loop has counted."""
+    derived = simulation.derived
+    return Summary(
+        scene=simulation.scene.name,
         model=simulation.model.name,
         blood_particles=derived.blood_particles,
         proxy_particles=derived.proxy_particles,
-        steps=steps,
-        frames=frame,
         simulated_time=figures.time,
-        wall_time=wall_time,
         median_step_ms=1e3 * statistics.median(step_times) if step_times else math.nan,
-        real_time_factor=(figures.time - first_time) / wall_time,
         leaks=figures.leaks,
-        most_leaks=most_leaks,
         wall_corrections=figures.wall_corrections,
         compression_p99=figures.compression_p99,
-        most_compression_p99=most_compression,
         kinetic_energy=figures.kinetic_energy,
         particles=figures.particles,
         drained_volume=figures.drained_volume,
+        drained=figures.drained,
+        added_volume=figures.added_volume,
         fallback_share=figures.fallback_share,
-        diverged=isinstance(error, RunError),
-        ending=ending,
+        **counted,
     )
-    return Outcome(summary, error, stopped)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 from rich.table import Table
+from rich.text import Text
 
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, read_scene
@@ -136,6 +137,9 @@ def measure(scene: Scene) -> tuple["Vessel", "list[Finding]", "WallSample", "Der
     return vessel, check_vessel(vessel), wall, derived
 
 
+_OK, _NOTE = Text("ok", style="green"), Text("note", style="yellow")
+
+
 def _two_columns(title: str) -> Table:
     table = Table(
         title=title, title_justify="left", box=None, pad_edge=False, show_header=False, min_width=60
@@ -154,7 +158,7 @@ def info_tables(scene: Scene) -> list[Table]:
     vessel, findings, wall, derived = measure(scene)
     checks = _two_columns(f"{scene.name}: {scene.title}\nsurface {vessel.label}")
     for finding in findings:
-        checks.add_row("[green]ok[/]" if finding.good else "[yellow]note[/]", finding.text)
+        checks.add_row(_OK if finding.good else _NOTE, finding.text)
 
     grid = scene.discretization
     numbers = _two_columns("\nderived numbers")

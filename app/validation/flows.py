@@ -23,6 +23,19 @@ from taichi_sph.particles.wall import Wall
 DENSITY = 1060.0
 """rho_0 of blood, as scenes have it [kg/m^3]."""
 
+VISCOSITY = 3.5e-3
+"""Of Newtonian blood [Pa s]."""
+
+GRAVITY = 9.81
+"""[m/s^2]."""
+
+MACH = 10.0
+"""Sound speed over the largest speed, the scenes' default."""
+
+BACKGROUND = 2.0
+"""Background pressure of flows without a free surface [rho U^2]: the least that keeps the pressure
+above zero everywhere.  Particles under pressure resist shear like grains, so it must be small."""
+
 SLAB = 8
 """Spacings along a periodic axis on which nothing depends."""
 

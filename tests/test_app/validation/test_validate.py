@@ -6,23 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.validation.validate import (
-    CASES,
-    Curve,
-    Report,
-    Row,
-    harmonic,
-    main,
-    relative_l2,
-    table_of,
-    watched,
-)
+from app.validation.pipes import harmonic
+from app.validation.report import Curve, Report, Row, relative_l2, watched
+from app.validation.validate import CASES, Case, main, table_of
 from taichi_sph.errors import InputError
 from taichi_sph.motion import Motion
 
 
 def test_an_unknown_case_is_refused_with_the_names_that_exist():
-    with pytest.raises(InputError, match=r"--only couette: allowed are kernel, momentum"):
+    with pytest.raises(
+        InputError, match=r"validate couette: no such case; allowed are kernel, momentum"
+    ):
         main(only=["couette"])
 
 
@@ -38,9 +32,24 @@ def test_a_row_passes_within_its_tolerance_only(error, passed):
 
 
 def test_a_row_that_misses_says_so():
-    table = table_of([Row("a", "1", "1", 0.0, 0.05, 0.1), Row("b", "2", "1", 1.0, 0.05, 0.1)])
-    verdicts = list(table.columns[5].cells)
-    assert verdicts == ["[green]pass[/]", "[bold red]MISS[/]"]
+    rows = [
+        Row("a", "1", "1", 0.0, 0.05, 0.1), Row("b", "2", "1", 1.0, 0.05, 0.1),
+        Row("c", "2", "1", 1.0, 0.05, 0.1, "too coarse"),
+        Row("d", "1", "1", 0.0, 0.05, 0.1, "too coarse"),
+    ]  # fmt: skip
+    verdicts = [str(cell) for cell in table_of(rows).columns[5].cells]
+    assert verdicts == ["pass", "MISS", "known miss", "pass"]
+
+
+@pytest.mark.parametrize(("known", "code"), [("", 1), ("too coarse", 0)])
+def test_only_a_miss_that_is_not_known_fails(known, code, monkeypatch, capsys):
+    def run(report, quick):
+        report.compare("speed", 2.0, 1.0, 0.05, known=known)
+
+    monkeypatch.setattr("app.validation.validate.start", lambda *_: None)
+    monkeypatch.setattr("app.validation.validate.CASES", (Case("one", "a case", "f32", run),))
+    assert main() == code
+    assert ("known to miss: speed: too coarse" in capsys.readouterr().out) == (code == 0)
 
 
 def test_the_relative_error_is_of_the_norms():
