@@ -486,7 +486,7 @@ def test_the_cache_gives_the_same_points_and_survives_damage(
         calls.append(given)
         return real(*given)
 
-    monkeypatch.setattr(wall_sampling, "even_points", counted)
+    monkeypatch.setattr(wall_sampling, "relaxed_points", counted)
     stored = pipe().sample_wall(1e-3, 0.5e-3)
     assert not calls
     assert stored.positions.tobytes() == first.positions.tobytes()
