@@ -5,7 +5,6 @@ import importlib.util
 import io
 import json
 import math
-import os
 import sys
 import tempfile
 from collections.abc import Collection, Sequence
@@ -13,10 +12,12 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
+import msgspec
 from rich.console import Console
 from rich.table import Table
 
 from taichi_sph.errors import InputError
+from taichi_sph.system import replaced
 
 
 def require_matplotlib(option: str) -> None:
@@ -97,22 +98,8 @@ def write_bytes(path: Path, content: bytes) -> None:
     Raises:
         OSError: the disk is full, or the folder is gone.
     """
-    if path.exists() and not path.is_file():
-        path.write_bytes(content)  # a device or a pipe: nothing to replace
-        return
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    with replaced(path) as file:
+        file.write(content)
 
 
 RowType = TypeVar("RowType")
@@ -126,14 +113,10 @@ def read_rows(path: Path, row: type[RowType]) -> list[RowType]:
     """
     if not path.exists() or not path.stat().st_size:
         return []
-    columns: Any = fields(row)  # type: ignore[arg-type]
     try:
-        with path.open(newline="") as file:
-            return [
-                row(**{c.name: c.type(line[c.name]) for c in columns})
-                for line in csv.DictReader(file)
-            ]
-    except (KeyError, TypeError, ValueError, csv.Error):
+        with path.open(newline="", encoding="utf-8") as file:
+            return [msgspec.convert(line, row, strict=False) for line in csv.DictReader(file)]
+    except (msgspec.ValidationError, UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: holds something else, or is cut; name another") from None
 
 

@@ -1,7 +1,6 @@
 """Weights: raw arrays and what they were made for, in one `.npz`; needs no torch."""
 
 import json
-import os
 import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from nn.features import NAMES, TABLE_VERSION, Inputs
 from taichi_sph.errors import InputError
 from taichi_sph.fluid.wcsph import Fluid
+from taichi_sph.system import replaced
 
 HEADS = ("direct", "pressure")
 SCHEMA = 3
@@ -112,7 +112,7 @@ class Weights:
         return y * self.scale
 
     def save(self, path: Path) -> None:
-        """Write the file, atomically."""
+        """Write the file, whole or not at all."""
         arrays: dict[str, Any] = {
             "mean": self.mean,
             "deviation": self.deviation,
@@ -122,12 +122,8 @@ class Weights:
         }
         for k, (w, b) in enumerate(self.layers):
             arrays[f"weight_{k}"], arrays[f"bias_{k}"] = w, b
-        temporary = path.with_name(path.name + ".part")
-        with temporary.open("wb") as file:
+        with replaced(path) as file:
             np.savez(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> "Weights":

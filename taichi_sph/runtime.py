@@ -1,12 +1,13 @@
 """Start Taichi: the only call of `ti.init` in the repository."""
 
 import contextlib
-import os
 
 import numpy as np
 import taichi as ti
 
 from taichi_sph.errors import InputError
+from taichi_sph.system import pin, processors
+from taichi_sph.system import threads as known_threads
 
 ARCHITECTURES = ("cpu", "gpu")
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
@@ -17,14 +18,6 @@ def float_dtype() -> type[np.floating]:
     return np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
 
 
-def _threads() -> set[int]:
-    """Threads of this process by number, which grows; none where Linux' /proc is not."""
-    try:
-        return {int(name) for name in os.listdir("/proc/self/task")}
-    except OSError:
-        return set()
-
-
 def _pin(workers: list[int]) -> None:
     """Give each of Taichi's threads, the last that it makes, a processor of its own.
 
@@ -32,11 +25,11 @@ def _pin(workers: list[int]) -> None:
     millisecond, longer than a pass over 16 000 particles: two cores are then no faster than one.
     Only where every processor gets a thread: programs with fewer would all sit on the first.
     """
-    if not workers or len(workers) != len(os.sched_getaffinity(0)):
+    available = processors()
+    if not workers or len(workers) != len(available):
         return
-    for worker, processor in zip(workers, sorted(os.sched_getaffinity(0)), strict=True):
-        with contextlib.suppress(OSError):
-            os.sched_setaffinity(worker, {processor})
+    for worker, processor in zip(workers, available, strict=True):
+        pin(worker, processor)
 
 
 def start(
@@ -63,7 +56,7 @@ def start(
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: allowed are {', '.join(PRECISIONS)}")
     options = {"cpu_max_num_threads": threads} if threads else {}
-    others = _threads()
+    others = known_threads()
     with contextlib.redirect_stdout(None):  # it prints a line whatever its log level
         ti.init(
             arch=[ti.cuda, ti.metal] if arch == "gpu" else ti.cpu,
@@ -80,7 +73,7 @@ def start(
             **options,
         )
     if arch == "cpu":
-        _pin(sorted(_threads() - others)[-ti.cfg.cpu_max_num_threads :])
+        _pin(sorted(known_threads() - others)[-ti.cfg.cpu_max_num_threads :])
     if arch == "gpu" and ti.cfg.arch in (ti.x64, ti.arm64):
         raise InputError("--arch gpu: no CUDA or Metal device was found; use --arch cpu")
 

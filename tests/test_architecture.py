@@ -11,6 +11,7 @@ from places import ROOT
 
 ROOMS = (
     "taichi_sph.errors",
+    "taichi_sph.system",
     "taichi_sph.runtime",
     "taichi_sph.scene",
     "taichi_sph.waveform",
@@ -50,8 +51,8 @@ ROOMS = (
 )
 """Files and folders in order: one imports itself and what stands before it."""
 
-WITHOUT_TAICHI = ("taichi_sph.errors", "taichi_sph.scene", "taichi_sph.waveform",
-                  "taichi_sph.geometry")  # fmt: skip
+WITHOUT_TAICHI = ("taichi_sph.errors", "taichi_sph.system", "taichi_sph.scene",
+                  "taichi_sph.waveform", "taichi_sph.geometry")  # fmt: skip
 
 ONLY_IN = {
     "rerun": ("app.view.rerun_view",),

@@ -7,7 +7,6 @@ frames or blocks of steps, neighbour search included; nothing is logged or drawn
 import math
 import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from app.scenes.library import weights_for, with_column
 from app.studies.splishsplash import begin, require_peer, rigid_wall
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, parse_scene, read_scene
+from taichi_sph.system import largest_memory
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -71,7 +71,7 @@ def _row(case: str, blood: int, proxies: int, steps: list[float], dt: float) -> 
         step_ms_high=1e3 * high,
         microseconds_per_particle_step=1e6 * middle / blood,
         real_time_factor=dt / middle,
-        memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        memory_mib=largest_memory() / 2**20,
     )
 
 

@@ -16,7 +16,6 @@ is kept, not the one with the lowest loss.
 import hashlib
 import itertools
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -38,6 +37,7 @@ from taichi_sph.fluid.calibration import softening
 from taichi_sph.fluid.implicit import LARGEST_VISCOSITY, LEAST_RESPONSE, RELAXATION
 from taichi_sph.fluid.wcsph import AccelerationModel
 from taichi_sph.geometry.vessel import read_vessel
+from taichi_sph.system import replaced
 
 PERIOD = 5
 """a: samples between two corrections (the paper's value)."""
@@ -557,9 +557,8 @@ def _save(
     generator: np.random.Generator,
     at: Progress,
 ) -> None:
-    """Write a checkpoint, atomically."""
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
+    """Write a checkpoint, whole or not at all."""
+    with replaced(path) as file:
         torch.save(
             {
                 "identity": identity,
@@ -570,9 +569,6 @@ def _save(
             },
             file,
         )
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def _resume(

@@ -7,7 +7,6 @@ blue_noise gives the same evenness in six times the time and cannot be repeated.
 import contextlib
 import hashlib
 import os
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from taichi_sph.geometry.mesh import (
     corner_normals,
     face_vectors,
 )
+from taichi_sph.system import replaced
 
 ALGORITHM = 1
 """Change it when the points change: it is part of the cache's key."""
@@ -187,19 +187,12 @@ def store_cached(key: str, sample: WallSample) -> None:
         sample.dropped,
     )
     path = _cache_file(key)
-    temporary = None
-    try:
+    with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        with os.fdopen(handle, "wb") as file:
+        with replaced(path) as file:
             np.savez(
                 file,
                 positions=sample.positions,
                 normals=sample.normals,
                 figures=np.array(figures),
             )
-        os.replace(temporary, path)
-    except OSError:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
