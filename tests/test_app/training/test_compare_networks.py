@@ -45,7 +45,8 @@ def test_a_line_has_medians_and_counts_the_dead():
 def test_one_rung_is_measured_and_what_is_measured_is_not_repeated(box: Path, tmp_path: Path):
     data, out, picture = box / "data.h5", tmp_path / "ladder.json", tmp_path / "ladder.png"
     code = (
-        "from pathlib import Path; import json; from app.training.compare_networks import Task, measure, RUNGS;"
+        "from pathlib import Path; import json;"
+        "from app.training.compare_networks import Task, measure, RUNGS;"
         "rung = next(rung for rung in RUNGS if rung.name == 'pressure, no input');"
         f"print(json.dumps(measure(Task(Path({str(data)!r}), rung, 0, 6, 'cpu'))))"
     )
