@@ -34,7 +34,7 @@ class VesselTable(_Table):
     """The lumen surface."""
 
     surface: str
-    """Surface file (STL, PLY, OBJ), relative to the scene file."""
+    """Surface file (STL, PLY, OBJ, VTP, VTK), relative to the scene file."""
     scale: Positive = 1.0
     """Metres per unit of the surface file [m]."""
 
@@ -82,7 +82,7 @@ class ToolTable(_Table):
     """A rigid tool that a session moves."""
 
     surface: str
-    """Closed surface file (STL, PLY, OBJ), relative to the scene file."""
+    """Closed surface file (STL, PLY, OBJ, VTP, VTK), relative to the scene file."""
     position: Vector
     """Where the origin of that file is at the start [m]: the tip, which suction is at."""
     scale: Positive = 1.0

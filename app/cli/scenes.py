@@ -47,7 +47,7 @@ def info(scene: str) -> None:
     help="Distance between blood particles [m].  [default: fits the narrowest place]",
 )
 def new(surface: Path, out: Path | None, scale: float | None, spacing: float | None) -> None:
-    """Make a scene folder of a vessel's surface (STL, PLY, OBJ), capped or open."""
+    """Make a scene folder of a vessel's surface (STL, PLY, OBJ, VTP, VTK), capped or open."""
     from app.scenes.new_scene import create_scene
 
     click.echo(create_scene(surface, out, scale, spacing))

@@ -32,7 +32,8 @@ def create_scene(
     """Turn a surface file into a folder with lumen.ply, scene.toml and README.md.
 
     Args:
-        path: Mesh of a lumen, closed with flat caps or open at its ends (STL, PLY, OBJ).
+        path: Mesh of a lumen, closed with flat caps or open at its ends (STL, PLY, OBJ,
+            VTP, VTK).
         out: Folder to make; it must not exist.  None: the file's name, in the working directory.
         scale: Metres per unit of the file; None guesses it from the size.
         spacing: Distance between blood particles [m]; None chooses it.

@@ -177,7 +177,7 @@ def inside_polygon(points: Floats, polygon: Floats) -> Booleans:
     return result
 
 
-def _cut_ears(polygon: Floats) -> Integers:
+def cut_ears(polygon: Floats) -> Integers:
     """Triangles of a simple polygon (n, 2) that turns left, by cutting ears."""
     rest = list(range(len(polygon)))
     triangles = []
@@ -247,7 +247,7 @@ def fill_polygon(rim: Floats) -> tuple[Floats, Integers]:
         except QhullError:
             triangles = None
     if triangles is None:
-        return np.zeros((0, 3)), _cut_ears(flat)
+        return np.zeros((0, 3)), cut_ears(flat)
     return centre + inner[:, :1] * first + inner[:, 1:] * second, triangles
 
 

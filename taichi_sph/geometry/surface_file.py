@@ -7,41 +7,59 @@ from pathlib import Path
 
 import igl
 import numpy as np
-import trimesh
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
-from taichi_sph.geometry.mesh import Floats, Integers
+from taichi_sph.geometry.mesh import Booleans, Floats, Integers
+from taichi_sph.geometry.surface_formats import (
+    FormatError,
+    Polygons,
+    read_obj,
+    read_ply,
+    read_stl,
+)
+from taichi_sph.geometry.vtk_formats import HINT, read_vtk, read_vtp
+
+READERS = {
+    ".stl": read_stl,
+    ".ply": read_ply,
+    ".obj": read_obj,
+    ".vtp": read_vtp,
+    ".vtk": read_vtk,
+}
+FORMATS = "STL, PLY, OBJ, VTP, VTK (PolyData)"
 
 
 def load_surface(path: Path) -> tuple[Floats, Integers]:
-    """Read a mesh file (STL, PLY, OBJ and what else trimesh reads) in the file's own units.
+    """Read a mesh file (STL, PLY, OBJ, VTP, VTK) in the file's own units.
+
+    Returns:
+        vertices (n, 3) as the file has them, triangles (m, 3); polygons are cut into triangles.
 
     Raises:
-        InputError: the file cannot be read, holds no triangle or a number that is not finite.
+        InputError: the file cannot be read, is cut, holds no triangle or a number that is not
+            finite.
     """
+    kind = path.suffix.lower()
     try:
-        with path.open("rb") as file:
-            loaded = trimesh.load(
-                file, file_type=path.suffix.lstrip(".").lower(), process=False, force="mesh"
-            )
-        vertices = np.array(loaded.vertices, np.float64).reshape(-1, 3)
-        faces = np.array(loaded.faces, np.int64).reshape(-1, 3)
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot read the surface: {error.strerror or error}") from None
-    except Exception as error:
-        # Mesh readers fail in every way on bytes that are not what the name promises.
-        reason = str(error).splitlines()[0][:100] if str(error) else type(error).__name__
-        kind = path.suffix or "(none)"
+    if kind not in READERS:
         raise InputError(
-            f"{path}: not a readable {kind} surface ({reason}); allowed: STL, PLY, OBJ"
+            f"{path}: not a readable {kind or '(none)'} surface; allowed: {FORMATS}"
+            + (f"; {HINT}" if kind.startswith((".vt", ".pvt")) else "")
+        )
+    try:
+        polygons = READERS[kind](data)
+        faces = triangulate(polygons)
+    except FormatError as error:
+        raise InputError(
+            f"{path}: not a readable {kind} surface: {error}; allowed: {FORMATS}"
         ) from None
+    vertices = polygons.points
     if len(faces) == 0 or len(vertices) == 0:
         raise InputError(f"{path}: the surface has no triangles; a closed or open tube is needed")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(
-            f"{path}: a triangle refers to vertex {faces.max()}, but the file has {len(vertices)}"
-        )
     bad = ~np.isfinite(vertices).all(axis=1)
     if bad.any():
         raise InputError(
@@ -49,6 +67,64 @@ def load_surface(path: Path) -> tuple[Floats, Integers]:
             f"(first: vertex {int(np.argmax(bad))}); all must be finite"
         )
     return vertices, faces
+
+
+def triangulate(polygons: Polygons) -> Integers:
+    """Triangles (m, 3) of polygons, in their order; those of fewer than 3 corners are left out.
+
+    A polygon that bulges everywhere is cut from its first corner, any other by cutting ears.
+
+    Raises:
+        FormatError: a polygon refers to a vertex that is not there, or crosses itself.
+    """
+    points, corners, sizes = polygons.points, polygons.corners, polygons.sizes
+    if len(corners) and (corners.min() < 0 or corners.max() >= len(points)):
+        wrong = corners.min() if corners.min() < 0 else corners.max()
+        raise FormatError(f"a polygon refers to vertex {wrong}, but the file has {len(points)}")
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    starts = np.cumsum(sizes) - sizes
+    rows, triangles = [np.zeros(0, np.int64)], [np.zeros((0, 3), np.int64)]
+    for size in np.unique(sizes[sizes >= 3]).tolist():
+        members = np.flatnonzero(sizes == size)
+        table = corners[starts[members, None] + np.arange(size)]
+        fan = np.stack([np.zeros(size - 2, int), *(np.arange(size - 2) + k for k in (1, 2))], 1)
+        cut = table[:, fan]
+        for k in np.flatnonzero(~_bulging(points, table)):
+            cut[k] = _cut_polygon(points, table[k], int(members[k]))
+        triangles.append(cut.reshape(-1, 3))
+        rows.append(np.repeat(members, size - 2))
+    order = np.argsort(np.concatenate(rows), kind="stable")
+    return np.concatenate(triangles)[order]
+
+
+def _bulging(points: Floats, table: Integers) -> Booleans:
+    """Which polygons of as many corners (k, size) turn one way at each of them; triangles do."""
+    with np.errstate(invalid="ignore"):  # not finite: said later, by the vertex
+        place = points[table]
+        along = np.roll(place, -1, axis=1) - place
+        turn = np.cross(np.roll(along, 1, axis=1), along)
+        normal = np.cross(place - place[:, :1], np.roll(place, -1, axis=1) - place[:, :1]).sum(
+            axis=1
+        )
+        return np.asarray((np.einsum("ksc,kc->ks", turn, normal) >= 0).all(axis=1))
+
+
+def _cut_polygon(points: Floats, polygon: Integers, number: int) -> Integers:
+    """Triangles of one polygon, by cutting ears in the plane of its area."""
+    place = points[polygon]
+    centre, normal, area = mesh.loop_plane(place)
+    if not area > 0.0:
+        # Flat to a line, or not finite: any cut will do, for what follows looks at it.
+        return np.stack([np.full(len(polygon) - 2, polygon[0]), polygon[1:-1], polygon[2:]], axis=1)
+    first, second = mesh.plane_axes(normal)
+    try:
+        cut = mesh.cut_ears(np.stack([(place - centre) @ first, (place - centre) @ second], axis=1))
+    except ValueError:
+        raise FormatError(
+            f"polygon {number + 1}, of {len(polygon)} corners, crosses itself"
+        ) from None
+    return polygon[cut]
 
 
 def where(point: Floats) -> str:
