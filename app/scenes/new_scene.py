@@ -141,11 +141,12 @@ def _openings(
     Raises:
         InputError: there are fewer than two, or an end bulges.
     """
-    closed, closed_faces, _ = close_holes(vertices, faces, label, scale)
+    closed, closed_faces, holes = close_holes(vertices, faces, label, scale)
     if mesh.enclosed_volume(closed, closed_faces) < 0:
         faces = np.ascontiguousarray(faces[:, ::-1])
+        closed, closed_faces, holes = close_holes(vertices, faces, label, scale)
         notes.append("normals: pointed inwards; turned round")
-    ends = find_openings(vertices, faces, label, scale, blunt=True)
+    ends = find_openings(closed, closed_faces, holes, label, scale, thorough=True)
     for cap in ends.doubtful:
         if cap.bulge > BULGE:
             raise InputError(

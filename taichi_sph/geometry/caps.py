@@ -24,9 +24,9 @@ SHARP = 30.0
 """A rim turns by more [degrees]: a cut at 60 degrees to the axis still does."""
 FLAT = 1e-3
 """A cap whose vertices all lie so near to its rim's plane [radii] stays as it is."""
-BULGE = 0.12
+BULGE = 0.2
 """A cap that stands farther off its rim's plane [radii] is a dome, no cut through a vessel.  A ball
-of which 45 degrees are seen stands off by 0.41, an oblate one of 1:7 by this."""
+of which 45 degrees are seen stands off by 0.41, an oblate one of 1:4 by this."""
 ROUND, OVAL = 0.6, 0.4
 """4 pi area / rim^2 that an end reaches: a disc 1, a square 0.785, a strip of 1:2 0.70.  A flat end
 between the two is named and not taken; a hole there is one that was cut on purpose."""
@@ -50,6 +50,8 @@ class Cap:
     """Of the circle of the rim's area."""
     bulge: float
     """How far the cap stands off the rim's plane [radii]."""
+    rim_height: float
+    """From the lowest to the highest place of the rim, along the normal [radii]."""
     roundness: float
     """4 pi area / rim^2."""
 
@@ -114,6 +116,22 @@ class _Skin:
         border = (own[first] != own[second]) & on_rim[self.edges].all(axis=1)
         return np.where(own[first[border]], second[border], first[border])
 
+    def falls_away(self, cap: "Cap") -> bool:
+        """Whether the wall beyond a rim goes down from the cap's plane, for a radius too.
+
+        A facet of a coarse or noisy wall has its like around it.
+        """
+        beyond = self.beyond(cap.faces, cap.rim)
+        if np.abs(self.normals[beyond] @ cap.normal).mean() > STEEP:
+            return False
+        near = np.linalg.norm(self.middles - cap.centre, axis=1) < 2.0 * cap.radius
+        near[beyond] = True
+        near[cap.faces] = False
+        _, part = self.joined(np.all(near[self.pairs], axis=1))
+        around = near & np.isin(part, part[beyond])
+        level = np.abs(self.normals[around] @ cap.normal)
+        return bool(np.average(level, weights=self.areas[around]) <= STEEP)
+
     def filled(self, members: Integers) -> Integers:
         """A patch with what it encloses: all but the largest part of the rest."""
         own = np.zeros(len(self.faces), bool)
@@ -131,7 +149,9 @@ def _cap(skin: _Skin, members: Integers, loop: Integers) -> Cap:
     radius = math.sqrt(area / math.pi)
     height = (skin.vertices[np.unique(skin.faces[members])] - centre) @ normal
     bulge = float(np.abs(height).max()) / max(radius, 1e-300)
-    return Cap(members, loop, centre, normal, radius, bulge, 4 * math.pi * area / around**2)
+    uneven = float(np.ptp((rim - centre) @ normal)) / max(radius, 1e-300)
+    roundness = 4 * math.pi * area / around**2
+    return Cap(members, loop, centre, normal, radius, bulge, uneven, roundness)
 
 
 def _loops(faces: Integers) -> list[Integers]:
@@ -211,10 +231,8 @@ def find_caps(vertices: Floats, faces: Integers, label: str, scale: float = 1.0)
             if len(loops) != 1 or len(loops[0]) < 4:
                 continue
             cap = _cap(skin, members, loops[0])
-            steep = np.abs(skin.normals[skin.beyond(members, cap.rim)] @ cap.normal).mean()
-            height = (vertices[cap.rim] - cap.centre) @ cap.normal
-            level = np.ptp(height) <= 0.5 * cap.radius
-            if cap.radius > 0 and cap.roundness >= OVAL and level and steep <= STEEP:
+            disc = cap.radius > 0 and cap.roundness >= OVAL and cap.rim_height <= 0.5
+            if disc and skin.falls_away(cap):
                 found.append(cap)
     taken = np.zeros(len(faces), bool)
     caps = []

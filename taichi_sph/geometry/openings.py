@@ -18,6 +18,13 @@ from taichi_sph.geometry.tips import Tip, find_tips
 
 FEWEST_EDGES = 6
 """A hole of fewer edges is a triangle or two that are missing, no end of a tube."""
+AT_TIP = 1.6
+"""An end is a tip's if the tip is no farther from its middle [radii]: at the far side of a cut at
+60 degrees it is 1.41."""
+HALF = 0.5
+"""A cap smaller than this is a facet at the end of a branch [radii of the branch]."""
+LEVEL = 0.05
+"""The rim of a flat end that is at no tip is as flat as this [radii]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +73,9 @@ class Ends:
     found: list[Candidate]
     """Those from holes first, each group by area."""
     doubtful: list[Cap]
-    """Ends with a sharp rim that are no opening: domes and what is far from round."""
+    """Tips of branches that have a rim and are no opening: domes, and what is far from round."""
     blind: list[Tip]
-    """Ends of branches that are closed and have no rim; empty where they were not looked for."""
+    """Tips of branches that are closed and have no rim.  Both are empty if not looked for."""
 
 
 def close_holes(
@@ -186,58 +193,86 @@ def _refuse_concentric(vertices: Floats, loops: list[Integers], label: str, scal
 
 
 def find_openings(
-    vertices: Floats, faces: Integers, label: str, scale: float = 1.0, blunt: bool = False
-) -> Ends:
-    """Close a surface and find its ends, capped and open.
+    vertices: Floats, faces: Integers, holes: list[Candidate], label: str, scale: float = 1.0,
+    thorough: bool = False,
+) -> Ends:  # fmt: skip
+    """Find the ends of a closed surface, and make their caps flat.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3), outward.
+        holes: What `close_holes` has closed.
         label: What messages call the surface.
         scale: Metres per unit of the file, in which messages give places.
-        blunt: Whether to look for ends whose rim has been rounded off, and for blind ends.
+        thorough: Whether to follow the branches to their tips: ends whose rims have been rounded
+            off, flat ends that are far from round, and blind ends are found only so.
 
     Raises:
-        InputError: a hole is not the end of a tube, or the surface is that of a wall.
+        InputError: the surface is that of a wall.
     """
-    all_caps = caps.find_caps(vertices, faces, label, scale)
+    was_open = np.zeros(len(faces), bool)
+    for hole in holes:
+        was_open[hole.faces] = True
+    found = caps.find_caps(vertices, faces, label, scale)
+    found = [cap for cap in found if not was_open[cap.faces].any()]
+    ends = [cap for cap in found if cap.is_end]
+    doubtful: list[Cap] = []
+    blind: list[Tip] = []
+    if thorough:
+        ends, doubtful, blind = _at_tips(vertices, faces, holes, found)
     flat = [
         Candidate(*mesh.region_plane(vertices, faces[c.faces]), c.faces, from_hole=False)
-        for c in all_caps
-        if c.is_end and c.is_flat
+        for c in ends
+        if c.is_flat
     ]
-    uneven = [cap for cap in all_caps if cap.is_end and not cap.is_flat]
-    vertices, faces, found = _made_flat(vertices, faces, uneven, flat, label, scale)
-    blind = []
-    if blunt:
-        ends = np.zeros(len(faces), bool)
-        for candidate in found:
-            ends[candidate.faces] = True
-        rounded = []
-        for tip in find_tips(vertices, faces):
-            if ends[tip.faces].any():
-                continue
-            cap = caps.blunt_cap(vertices, faces, tip)
-            if cap is not None and cap.is_end:
-                rounded.append(cap)
-            elif cap is None or not any(_same(cap, other) for other in all_caps):
-                blind.append(tip)
-        if rounded:
-            vertices, faces, found = _made_flat(vertices, faces, rounded, found, label, scale)
-    found.sort(key=lambda c: (not c.from_hole, -c.area))
-    return Ends(vertices, faces, found, [cap for cap in all_caps if not cap.is_end], blind)
+    uneven = [cap for cap in ends if not cap.is_flat]
+    vertices, faces, made = _made_flat(vertices, faces, uneven, holes + flat, label, scale)
+    made.sort(key=lambda c: (not c.from_hole, -c.area))
+    return Ends(vertices, faces, made, doubtful, blind)
 
 
-def _same(cap: Cap, other: Cap) -> bool:
-    """Whether two caps are of one end."""
-    return bool(np.linalg.norm(cap.centre - other.centre) < max(cap.radius, other.radius))
+def _at_tips(
+    vertices: Floats, faces: Integers, holes: list[Candidate], found: list[Cap]
+) -> tuple[list[Cap], list[Cap], list[Tip]]:
+    """The caps that are ends, those at tips that are none, and the blind tips."""
+    # A piece of wall may be as flat as a small cap; away from tips only what is quite flat counts.
+    chosen = [cap for cap in found if cap.is_end and cap.rim_height < LEVEL]
+    doubtful, blind = [], []
+    for tip in find_tips(vertices, faces):
+        if any(np.linalg.norm(h.centre - tip.place) < AT_TIP * h.radius for h in holes):
+            continue
+        there = [
+            c
+            for c in found
+            if c.radius > HALF * tip.radius
+            and np.linalg.norm(c.centre - tip.place) < AT_TIP * c.radius
+        ]
+        there.sort(key=lambda c: float(np.linalg.norm(c.centre - tip.place)) / c.radius)
+        blunt = caps.blunt_cap(vertices, faces, tip)
+        if blunt is not None and not HALF < blunt.radius / max(tip.radius, 1e-300) < 1.5:
+            blunt = None
+        # A branch that ends so ends there, round or not.
+        cut = [
+            cap
+            for cap in [*there, *([blunt] if blunt is not None else [])]
+            if cap.bulge <= caps.BULGE and cap.roundness >= OVAL
+        ]
+        if cut:
+            chosen = [c for c in chosen if not np.isin(c.faces, cut[0].faces).any()] + cut[:1]
+        elif there:
+            doubtful.append(there[0])
+        else:
+            blind.append(tip)
+    return chosen, doubtful, blind
 
 
 def _made_flat(
     vertices: Floats, faces: Integers, uneven: list[Cap], others: list[Candidate], label: str,
     scale: float,
 ) -> tuple[Floats, Integers, list[Candidate]]:  # fmt: skip
-    """Close the holes, and those that caps which are not flat leave when they are taken out."""
+    """Take out the caps that are not flat and close the holes that they leave."""
+    if not uneven:
+        return vertices, faces, list(others)
     stays = np.ones(len(faces), bool)
     for cap in uneven:
         stays[cap.faces] = False
@@ -245,9 +280,7 @@ def _made_flat(
     others = [replace(other, faces=number[other.faces]) for other in others]
     bulges = {int(cap.rim.min()): cap.bulge for cap in uneven}
     vertices, faces, made = _close(vertices, faces[stays], label, scale, bulges)
-    if uneven:
-        vertices, faces = mesh.drop_unused(vertices, faces)
-    return vertices, faces, others + made
+    return *mesh.drop_unused(vertices, faces), others + made
 
 
 def is_round(vertices: Floats, faces: Integers, roundness: float) -> bool:

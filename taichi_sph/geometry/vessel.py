@@ -288,11 +288,11 @@ def build_vessel(
     if len(faces) == 0:
         raise InputError(f"{label}: all triangles have collapsed to lines; a tube is needed")
     require_manifold(vertices, faces, label)
-    closed, closed_faces, _ = close_holes(vertices, faces, label, scale)
-    require_outward(closed, closed_faces, label)
-    ends = find_openings(vertices, faces, label, scale)
+    vertices, faces, holes = close_holes(vertices, faces, label, scale)
+    require_outward(vertices, faces, label)
+    ends = find_openings(vertices, faces, holes, label, scale)
     if any(not _near(ends, np.array(table.centre) * scale) for table in openings.values()):
-        ends = find_openings(vertices, faces, label, scale, blunt=True)
+        ends = find_openings(vertices, faces, holes, label, scale, thorough=True)
     vertices, faces = ends.vertices, ends.faces
     matched = _match(openings, ends, scale, label)
     face_opening = np.full(len(faces), -1, np.int32)
