@@ -15,6 +15,7 @@ ROOMS = (
     "taichi_sph.runtime",
     "taichi_sph.scene",
     "taichi_sph.waveform",
+    "taichi_sph.scene_files",
     "taichi_sph.geometry",
     "taichi_sph.particles",
     "taichi_sph.fluid",
