@@ -25,6 +25,7 @@ ROOMS = (
     "taichi_sph.diagnostics",
     "taichi_sph.motion",
     "taichi_sph.simulation",
+    "taichi_sph.models",
     "taichi_sph",
     "nn.features",
     "nn.weights",
