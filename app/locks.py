@@ -5,40 +5,13 @@ the process, however that ends, and the file goes with it where the process live
 """
 
 import contextlib
-import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from taichi_sph.errors import InputError
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-    try:
-        import msvcrt
-    except ImportError:
-        msvcrt = None  # type: ignore[assignment]
-
-_HELD_ELSEWHERE = (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK)
-
-
-def _try_lock(file: BinaryIO) -> bool:
-    """Whether the file is now locked by us; False if somebody else holds it.
-
-    A file system that has no locks locks nothing: True.
-    """
-    try:
-        if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        elif msvcrt is not None:
-            file.seek(0)
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    except OSError as error:
-        return error.errno not in _HELD_ELSEWHERE
-    return True
+from taichi_sph.system import lock
 
 
 def _is_there_still(file: BinaryIO, path: Path) -> bool:
@@ -84,7 +57,7 @@ def claimed(path: Path | None, option: str) -> Iterator[None]:
             yield  # a folder of no use: who writes there says so
             return
         file, disposable = opened
-        if not _try_lock(file):
+        if not lock(file):
             file.close()
             raise InputError(f"{option} {path}: another run is writing it; name another file")
         if disposable is None or _is_there_still(file, disposable):

@@ -24,15 +24,11 @@ def model_factory(
     Raises:
         InputError: weights that cannot be read.
     """
-    if name == "implicit":
-        from taichi_sph.fluid.implicit import implicit_factory
-
-        return implicit_factory(scene)
     if name == "pcnet":
         from app.scenes.library import weights_for
         from nn.pcnet import load_pcnet
 
         return load_pcnet(weights or weights_for(scene), scene, guarded)
-    from taichi_sph.fluid.wcsph import SphAcceleration
+    from taichi_sph.models import implicit, physics
 
-    return SphAcceleration
+    return implicit(scene) if name == "implicit" else physics(scene)

@@ -1,7 +1,6 @@
 """One run from its options to its outputs: `vesselflow run` without a command line."""
 
 import contextlib
-import hashlib
 import importlib.util
 import os
 import sys
@@ -13,6 +12,7 @@ from app.run.options import DEFAULT_ERROR, RunOptions
 from app.scenes.library import find_scene, weights_for, with_column
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
+from taichi_sph.scene_files import file_hash, scene_files
 
 if TYPE_CHECKING:
     from app.control.session import Session
@@ -88,14 +88,14 @@ def facts_of(options: RunOptions, scene: Scene) -> dict[str, Any]:
         "scene": scene.name, "scene_text": scene.text,
         "particles": options.particles, "height": options.height, "model": options.model,
         "arch": options.arch, "precision": options.precision, "seed": options.seed,
-        "version": version(),
+        "version": version(), "files": scene_files(scene),
     }  # fmt: skip
     script = options.script
     if script is not None:
         facts["script"] = script.read_text(errors="replace") if script.is_file() else ""
-    if options.model == "pcnet":
-        content = (options.weights or weights_for(scene)).read_bytes()
-        facts["weights"] = hashlib.sha256(content).hexdigest()
+    weights = options.weights or weights_for(scene)
+    if options.model == "pcnet" or (options.is_acted_on and weights.is_file()):
+        facts["files"]["weights"] = file_hash(weights)
     return facts
 
 

@@ -1,6 +1,13 @@
 """Start Taichi: the only call of `ti.init` in the repository."""
 
+import atexit
 import contextlib
+import os
+import shutil
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -32,6 +39,57 @@ def _pin(workers: list[int]) -> None:
         pin(worker, processor)
 
 
+def _can_write(folder: Path) -> bool:
+    """Whether files can be made in a folder, which is made if it is not there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _kernel_cache() -> str | None:
+    """Folder for compiled kernels where Taichi's own cannot be written; None where it can.
+
+    Without a folder that it can write Taichi dies of a segmentation fault at the process' end.
+
+    Raises:
+        InputError: as `_temporary_cache`.
+    """
+    asked = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    if _can_write(Path(asked) if asked else Path(base, "taichi", "ticache")):
+        return None
+    # Taichi would warn of an argument that is not what the variable says.
+    os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+    return _temporary_cache()
+
+
+@cache
+def _temporary_cache() -> str:
+    """A folder for compiled kernels that goes with the process.
+
+    Raises:
+        InputError: nothing can be written anywhere.
+    """
+    try:
+        folder = tempfile.mkdtemp(prefix="vesselflow-kernels-")
+    except OSError as error:
+        raise InputError(
+            "no folder can be written for compiled kernels; let TI_OFFLINE_CACHE_FILE_PATH name "
+            f"one ({error.strerror})"
+        ) from None
+    atexit.register(_leave, folder)
+    return folder
+
+
+def _leave(folder: str) -> None:
+    """End Taichi, which writes its kernels then, and remove them."""
+    ti.reset()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
 def start(
     arch: str = "cpu",
     precision: str = "f32",
@@ -49,13 +107,16 @@ def start(
         random_seed: seed of Taichi's own generator.
 
     Raises:
-        InputError: an unknown architecture or precision, or no GPU.
+        InputError: an unknown architecture or precision, no GPU, or no folder for kernels.
     """
     if arch not in ARCHITECTURES:
         raise InputError(f"--arch {arch}: allowed are {', '.join(ARCHITECTURES)}")
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: allowed are {', '.join(PRECISIONS)}")
-    options = {"cpu_max_num_threads": threads} if threads else {}
+    options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
+    folder = _kernel_cache()
+    if folder is not None:
+        options["offline_cache_file_path"] = folder
     others = known_threads()
     with contextlib.redirect_stdout(None):  # it prints a line whatever its log level
         ti.init(

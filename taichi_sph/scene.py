@@ -4,11 +4,13 @@ Nothing here imports taichi; derived numbers are worked out elsewhere and printe
 """
 
 import math
+import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_type_hints
+from typing import Annotated, Any, Literal, Union
 
 import msgspec
+from msgspec import inspect
 
 from taichi_sph.errors import InputError
 
@@ -23,6 +25,10 @@ LARGEST = 1e12
 Positive = Annotated[float, msgspec.Meta(gt=0, lt=LARGEST)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0, lt=LARGEST)]
 Coordinate = Annotated[float, msgspec.Meta(gt=-LARGEST, lt=LARGEST)]
+SurfaceFile = Annotated[str, msgspec.Meta(extra={"file": "surface"})]
+ToolFile = Annotated[str, msgspec.Meta(extra={"file": "tool"})]
+WaveformFile = Annotated[str | None, msgspec.Meta(extra={"file": "waveform"})]
+"""Keys that name a file are of such a type: `scene_files` then knows it by its content."""
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -33,7 +39,7 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class VesselTable(_Table):
     """The lumen surface."""
 
-    surface: str
+    surface: SurfaceFile
     """Surface file (STL, PLY, OBJ, VTP, VTK), relative to the scene file."""
     scale: Positive = 1.0
     """Metres per unit of the surface file [m]."""
@@ -50,7 +56,7 @@ class OpeningTable(_Table):
     """Blood that a pump drives in [m^3/s], out where negative."""
     pressure: Coordinate | None = None
     """Pressure that a reservoir holds there [Pa], over that outside the vessel."""
-    waveform: str | None = None
+    waveform: WaveformFile = None
     """What flow or pressure is multiplied by: the name of a built-in one, or a CSV file (time [s],
     factor), relative to the scene file; it repeats.  Steady without."""
 
@@ -73,7 +79,7 @@ class WallTable(_Table):
 
     pulse: Positive
     """How far it moves out along its normal [m]; the surface of the file is its narrowest."""
-    waveform: str
+    waveform: WaveformFile
     """When: the name of a built-in waveform, or a CSV file (time [s], factor), relative to the
     scene file; its lowest factor is narrow, its highest wide."""
 
@@ -81,7 +87,7 @@ class WallTable(_Table):
 class ToolTable(_Table):
     """A rigid tool that a session moves."""
 
-    surface: str
+    surface: ToolFile
     """Closed surface file (STL, PLY, OBJ, VTP, VTK), relative to the scene file."""
     position: Vector
     """Where the origin of that file is at the start [m]: the tip, which suction is at."""
@@ -196,47 +202,89 @@ class Scene(_Table):
             )
 
 
-_RHEOLOGIES = {"newtonian": NewtonianTable, "casson": CassonTable}
-_TABLES = {
-    "": Scene,
-    "vessel": VesselTable,
-    "column": Column,
-    "blood": Blood,
-    "discretization": Discretization,
-    "openings": OpeningTable,
-    "tool": ToolTable,
-    "wall": WallTable,
-}
 _SET_BY_READER = ("folder", "name", "text")
+_WORDS = {
+    "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false",
+    "object": "a table", "array": "a list",
+}  # fmt: skip
+"""What TOML calls what msgspec names otherwise."""
 
 
-def _plain(error: Exception, table: dict[str, Any]) -> str:
-    """One sentence from msgspec's message: where, what was found, what is allowed."""
+def _tables_in(kind: inspect.Type) -> list[inspect.StructType]:
+    """Tables that a value of a kind may be: one for each rheology, for instance."""
+    if isinstance(kind, inspect.Metadata):
+        return _tables_in(kind.type)
+    if isinstance(kind, inspect.UnionType):
+        return [table for member in kind.types for table in _tables_in(member)]
+    return [kind] if isinstance(kind, inspect.StructType) else []
+
+
+def _kind_at(path: list[str], kind: inspect.Type, found: Any) -> tuple[inspect.Type, Any]:
+    """What may stand at a place below a table of a kind, and what does."""
+    for key in path:
+        tables = _tables_in(kind)
+        if key == tables[0].tag_field:
+            kind = inspect.LiteralType(values=tuple(str(each.tag) for each in tables))
+        else:
+            kind = next(f.type for f in _chosen(tables, found).fields if f.encode_name == key)
+        found = found.get(key) if isinstance(found, dict) else None
+    return kind, found
+
+
+def _chosen(tables: list[inspect.StructType], found: Any) -> inspect.StructType:
+    """The table that is meant among several: by its tag, where there is one."""
+    tag = found.get(tables[0].tag_field) if isinstance(found, dict) else None
+    return next((each for each in tables if each.tag == tag), tables[0])
+
+
+def _plain(error: Exception, of: type[msgspec.Struct], table: Any, place: str = "") -> str:
+    """One sentence from msgspec's message: where, what was found, what is allowed.
+
+    Args:
+        error: of a conversion.
+        of: what the table was to become.
+        table: as it was written.
+        place: of that table in the scene.
+    """
     what, _, path = str(error).replace("`", "").partition(" - at $")
     path = path.lstrip(".")
-    found: Any = table
-    for part in path.split(".") if path else []:
-        found = found.get(part, {}) if isinstance(found, dict) else {}
-    structure: Any = _TABLES.get(path.split(".")[0] if path.startswith("openings") else path)
-    if path == "blood.rheology" and isinstance(found, dict):
-        structure = _RHEOLOGIES.get(found.get("model", ""))
-    where = f"{path}: " if path else ""
+    kind, found = _kind_at(path.split(".") if path else [], inspect.type_info(of), table)
+    where = ".".join(part for part in (place, path) if part)
+    where += ": " if where else ""
     if what.startswith("Object contains unknown field"):
-        keys = [k for k in structure.__struct_fields__ if k not in _SET_BY_READER]
-        if path == "blood.rheology":
-            keys.insert(0, "model")
-        return f"{where}unknown key {what.split()[-1]}; allowed: {', '.join(keys)}"
+        structure = _chosen(_tables_in(kind), found)
+        keys = [structure.tag_field] if structure.tag_field else []
+        keys += [f.encode_name for f in structure.fields if f.encode_name not in _SET_BY_READER]
+        unknown = what.removeprefix("Object contains unknown field ")
+        return f"{where}unknown key {unknown}; allowed: {', '.join(keys)}"
     if what.startswith("Object missing required field"):
         return f"{where}the key {what.split()[-1]} is missing"
-    if what.startswith("Invalid"):
-        key = path.rpartition(".")[2]
-        choices: tuple[str, ...] = tuple(_RHEOLOGIES) if key == "model" else ()
-        for each in _TABLES.values():
-            choices = choices or get_args(get_type_hints(each).get(key))
-        return f"{where}found {found!r}; allowed: {', '.join(choices)}"
+    if what.startswith("Invalid") and isinstance(kind, inspect.LiteralType):
+        return f"{where}found {found!r}; allowed: {', '.join(map(str, kind.values))}"
     if what.startswith("Expected"):
-        return f"{where}found {found!r}; {what[0].lower()}{what[1:].partition(', got')[0]}"
+        wanted = what.removeprefix("Expected ").partition(", got")[0].removesuffix(" | null")
+        first, _, rest = wanted.partition(" ")
+        return f"{where}found {found!r}; expected {_WORDS.get(first, first)} {rest}".rstrip()
     return where + what
+
+
+def _check_entries(table: dict[str, Any], source: str) -> None:
+    """Check the tables that the user names, one by one: msgspec does not say which is wrong.
+
+    Raises:
+        InputError: one has a mistake.
+    """
+    for field in inspect.type_info(Scene).fields:  # type: ignore[attr-defined]
+        named = table.get(field.encode_name)
+        if not isinstance(field.type, inspect.DictType) or not isinstance(named, dict):
+            continue
+        (kind,) = _tables_in(field.type.value_type)
+        for label, entry in named.items():
+            try:
+                msgspec.convert(entry, kind.cls)
+            except msgspec.ValidationError as error:
+                place = f"{field.encode_name}.{label}"
+                raise InputError(f"{source}: {_plain(error, kind.cls, entry, place)}") from None
 
 
 def parse_scene(text: str, source: str, folder: Path, name: str) -> Scene:
@@ -253,20 +301,19 @@ def parse_scene(text: str, source: str, folder: Path, name: str) -> Scene:
         if key in table:
             raise InputError(f"{source}: unknown key {key}")
     table |= {"folder": str(folder), "name": name, "text": text}
+    _check_entries(table, source)
     try:
-        # One by one, for msgspec does not say which entry of a dictionary is wrong.
-        openings = table.get("openings")
-        for label, opening in openings.items() if isinstance(openings, dict) else ():
-            try:
-                msgspec.convert(opening, OpeningTable)
-            except msgspec.ValidationError as error:
-                place = str(error).replace("$", f"$.openings.{label}")
-                if "$" not in place:
-                    place += f" - at $.openings.{label}"
-                raise msgspec.ValidationError(place) from None
         return msgspec.convert(table, Scene)
     except msgspec.ValidationError as error:
-        raise InputError(f"{source}: {_plain(error, table)}") from None
+        raise InputError(f"{source}: {_plain(error, Scene, table)}") from None
+
+
+def scene_name(path: Path) -> str:
+    """The name of a scene's file: its folder's, however that is given, for `scene.toml`."""
+    whole = Path(os.path.abspath(path))  # not resolved: a link has a name of its own
+    name = whole.parent.name if whole.stem == "scene" else whole.stem
+    # A name that is no UTF-8 is shown and recorded like any other.
+    return os.fsencode(name).decode("utf-8", "replace") or "scene"
 
 
 def read_scene(path: Path) -> Scene:
@@ -280,5 +327,4 @@ def read_scene(path: Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise InputError(f"{path}: cannot read the scene: {reason}") from None
-    name = path.parent.name if path.stem == "scene" else path.stem
-    return parse_scene(text, str(path), path.parent.resolve(), name)
+    return parse_scene(text, str(path), path.parent.resolve(), scene_name(path))

@@ -15,13 +15,16 @@ import numpy as np
 
 from app.files import write_bytes
 from taichi_sph.errors import InputError
+from taichi_sph.scene_files import changed_file
 from taichi_sph.simulation import State
 
 if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics
     from taichi_sph.simulation import Simulation
 
-FORMAT = "vesselflow checkpoint 2"
+FORMAT = "vesselflow checkpoint 3"
+WITHOUT_FILES = "vesselflow checkpoint 2"
+"""The format before: its facts know of no file but the weights by content."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +60,13 @@ class Checkpoint:
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
                 head = json.loads(str(file["head"]))
-                if head["format"] != FORMAT:
+                if head["format"] not in (FORMAT, WITHOUT_FILES):
                     raise KeyError("format")
                 arrays = {name: file[name] for name in file.files if name != "head"}
-            state = State(**head["numbers"], **arrays)
-            return cls(head["facts"], head["frame"], state)
+            facts = head["facts"]
+            if head["format"] == WITHOUT_FILES:
+                facts["files"] = {"weights": facts.pop("weights")} if "weights" in facts else {}
+            return cls(facts, head["frame"], State(**head["numbers"], **arrays))
         except FileNotFoundError:
             raise InputError(f"--resume {path}: there is no such file") from None
         except (
@@ -77,15 +82,30 @@ class Checkpoint:
         Raises:
             InputError: which fact differs.
         """
-        for name, wanted in facts.items():
-            found = self.facts.get(name)
-            if found != wanted:
-                plain = name not in ("scene_text", "weights", "script")
-                values = f": {found} there, {wanted} here" if plain else ""
-                raise InputError(
-                    f"--resume {path}: is of another run, its {name.replace('_', ' ')} differs"
-                    f"{values}; give the command that wrote it"
-                )
+        different = difference(self.facts, facts)
+        if different is not None:
+            raise InputError(
+                f"--resume {path}: is of another run, its {different}; give the command that "
+                "wrote it, and the files that it read"
+            )
+
+
+def difference(then: dict[str, Any], now: dict[str, Any]) -> str | None:
+    """What differs between the facts of two runs, as a clause; None if it is the same run.
+
+    The files that the scene names are compared by content where both sides know it.
+    """
+    for name, wanted in now.items():
+        found = then.get(name)
+        if name == "files":
+            changed = changed_file(found or {}, wanted)
+            if changed is not None:
+                return f"{changed} differs" if wanted[changed] else f"{changed} is not there"
+        elif found != wanted:
+            plain = name not in ("scene_text", "script")
+            values = f": {found} there, {wanted} here" if plain else ""
+            return f"{name.replace('_', ' ')} differs{values}"
+    return None
 
 
 class Checkpointer:

@@ -1,3 +1,4 @@
+import json
 import random
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.run.checkpoint import Checkpoint, Checkpointer
+from app.run.checkpoint import Checkpoint, Checkpointer, difference
 from commands import HERE, vesselflow
 from taichi_sph.errors import InputError
 
@@ -125,6 +126,37 @@ def test_another_run_is_not_gone_on_with(
 ) -> None:
     command = ["run", str(box), "--height", "0.016", "--frames", "13", *changed]
     assert expected in vesselflow(Path.cwd(), *command, "--resume", whole["physics"], code=2)
+
+
+FACTS: dict[str, Any] = {
+    "scene": "pump", "scene_text": "title = 1", "seed": 0,
+    "files": {"surface lumen.ply": "a", "waveform beat.csv": "b", "weights": "c"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("file", sorted(FACTS["files"]))
+def test_a_file_that_has_changed_is_named(file: str) -> None:
+    assert difference(FACTS, FACTS) is None
+    changed = FACTS | {"files": FACTS["files"] | {file: "d"}}
+    assert difference(FACTS, changed) == f"{file} differs"
+    gone = FACTS | {"files": FACTS["files"] | {file: ""}}
+    assert difference(FACTS, gone) == f"{file} is not there"
+    unknown = FACTS | {"files": {name: x for name, x in FACTS["files"].items() if name != file}}
+    assert difference(unknown, FACTS) is None
+
+
+def test_a_checkpoint_of_the_format_before_is_read(whole: dict[str, Path], tmp_path: Path) -> None:
+    with np.load(whole["pcnet"]) as file:
+        arrays = dict(file)
+    head = json.loads(str(arrays.pop("head")))
+    weights = head["facts"].pop("files")["weights"]
+    head["facts"]["weights"] = weights
+    head["format"] = "vesselflow checkpoint 2"
+    np.savez(tmp_path / "old.npz", head=np.array(json.dumps(head)), **arrays)
+    old, new = Checkpoint.read(tmp_path / "old.npz"), Checkpoint.read(whole["pcnet"])
+    assert difference(old.facts, new.facts) is None
+    assert old.facts["files"] == {"weights": weights}
+    assert same(tmp_path / "old.npz", whole["pcnet"])
 
 
 def test_a_recording_of_the_run_so_far_is_not_replaced(
