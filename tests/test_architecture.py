@@ -15,6 +15,7 @@ ROOMS = (
     "taichi_sph.runtime",
     "taichi_sph.scene",
     "taichi_sph.waveform",
+    "taichi_sph.scene_files",
     "taichi_sph.geometry",
     "taichi_sph.particles",
     "taichi_sph.fluid",
@@ -33,8 +34,8 @@ ROOMS = (
     "nn",
     "app",
     "app.files",
-    "app.jobs",
     "app.progress",
+    "app.jobs",
     "app.scenes",
     "app.models",
     "app.run",
@@ -50,7 +51,8 @@ ROOMS = (
 """Files and folders in order: one imports itself and what stands before it."""
 
 WITHOUT_TAICHI = ("taichi_sph.errors", "taichi_sph.system", "taichi_sph.scene",
-                  "taichi_sph.waveform", "taichi_sph.geometry")  # fmt: skip
+                  "taichi_sph.waveform", "taichi_sph.scene_files",
+                  "taichi_sph.geometry")  # fmt: skip
 
 ONLY_IN = {
     "rerun": ("app.view.rerun_view",),

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 
 ALL = len(os.sched_getaffinity(0)) if sys.platform == "linux" else 0
 
