@@ -1,4 +1,4 @@
-"""Files that a scene names, known by their content: whether a run is of the same vessel."""
+"""Files that a scene names, by their content: to send, keep and compare them wherever they lie."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -40,12 +40,19 @@ def _named(table: msgspec.Struct) -> Iterator[tuple[str, str]]:
                 yield from _named(each)
 
 
+def named_files(scene: Scene) -> list[tuple[str, str]]:
+    """Kind and name of each file that a scene needs, as "surface" and "lumen.ply"."""
+    return [
+        (kind, name)
+        for kind, name in sorted(set(_named(scene)))
+        if not (kind == "waveform" and name in BUILT_IN)
+    ]
+
+
 def scene_files(scene: Scene) -> dict[str, str]:
     """SHA-256 of every file that a scene names, by kind and name, as "surface lumen.ply"."""
     return {
-        f"{kind} {name}": file_hash(Path(scene.folder) / name)
-        for kind, name in sorted(set(_named(scene)))
-        if not (kind == "waveform" and name in BUILT_IN)
+        f"{kind} {name}": file_hash(Path(scene.folder) / name) for kind, name in named_files(scene)
     }
 
 
@@ -80,3 +87,53 @@ def found_in(scene: Scene, files: dict[str, str], folders: Sequence[Path]) -> Sc
         else:
             wrong = wrong or f"its {changed} is not there ({folder})"
     raise InputError(f"{scene.name}: {wrong}")
+
+
+def sha256(content: bytes) -> str:
+    """SHA-256 of a file's content, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_files(scene: Scene) -> dict[str, bytes]:
+    """Contents of the files that a scene needs, by name.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    contents = {}
+    for name in dict.fromkeys(name for _, name in named_files(scene)):
+        path = Path(scene.folder) / name
+        try:
+            contents[name] = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    return contents
+
+
+def with_files(scene: Scene, contents: dict[str, bytes], folder: Path) -> Scene:
+    """Scene whose files are written into a folder, and which names them there.
+
+    Args:
+        scene: the scene; its own folder is not looked at.
+        contents: contents by name, of every file that the scene needs.
+        folder: an empty folder.
+    """
+    here = {}
+    for number, (name, content) in enumerate(contents.items()):
+        # Names may hold folders, or be alike but for them; the ending says what a file is.
+        here[name] = f"{number}-{name.replace(chr(92), '/').rpartition('/')[2]}"
+        (folder / here[name]).write_bytes(content)
+    change = msgspec.structs.replace
+
+    def moved(table: Any, field: str) -> Any:
+        name = getattr(table, field)
+        return change(table, **{field: here.get(name, name)})
+
+    return change(
+        scene,
+        folder=str(folder),
+        vessel=moved(scene.vessel, "surface"),
+        openings={name: moved(table, "waveform") for name, table in scene.openings.items()},
+        tool=scene.tool and moved(scene.tool, "surface"),
+        wall=scene.wall and moved(scene.wall, "waveform"),
+    )

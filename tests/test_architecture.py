@@ -35,9 +35,9 @@ ROOMS = (
     "nn",
     "app",
     "app.files",
-    "app.jobs",
     "app.locks",
     "app.progress",
+    "app.jobs",
     "app.scenes",
     "app.models",
     "app.view",
@@ -54,7 +54,8 @@ ROOMS = (
 """Files and folders in order: one imports itself and what stands before it."""
 
 WITHOUT_TAICHI = ("taichi_sph.errors", "taichi_sph.system", "taichi_sph.scene",
-                  "taichi_sph.waveform", "taichi_sph.geometry")  # fmt: skip
+                  "taichi_sph.waveform", "taichi_sph.scene_files",
+                  "taichi_sph.geometry")  # fmt: skip
 
 ONLY_IN = {
     "rerun": ("app.view.rerun_view",),

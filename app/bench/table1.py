@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.files import check_plots, console, table, write_json
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from app.scenes.library import weights_for, with_column
 from app.studies.splishsplash import begin, require_peer, rigid_wall
 from taichi_sph.errors import InputError

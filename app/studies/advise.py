@@ -17,7 +17,7 @@ from pathlib import Path
 from rich.table import Table
 
 from app.files import read_rows, table
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from app.studies.chart import Job, Row, check_end, main, pour
 from app.studies.methods import METHODS, Method
 from app.studies.stability import CASES

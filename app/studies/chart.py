@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from app.files import console, read_rows, table, write_rows
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from app.progress import Progress, duration
 from app.studies.methods import FLOOR, METHODS, PEERS, REFERENCE, Method, of_weights
 from app.studies.splishsplash import require_peer

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from places import ROOT
 
 ALL = len(os.sched_getaffinity(0)) if sys.platform == "linux" else 0

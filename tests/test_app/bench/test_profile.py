@@ -1,7 +1,7 @@
 import numpy as np
 
 from app.bench import profile as passes
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from app.scenes.library import find_scene, varied, weights_for
 from builders import D, ball, sphere
 

@@ -5,7 +5,7 @@ import pytest
 
 from app.bench import table1 as bench
 from app.bench.control_cost import FRAMES, measure_overhead
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from app.scenes.library import scene_path, weights_for
 from browser import needs_viser
 from taichi_sph.errors import InputError

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.jobs import in_own_process
+from app.jobs.process import in_own_process
 from app.scenes.library import find_scene, with_column
 from app.studies import chart
 from app.studies.methods import METHODS, PEERS, Method

@@ -1,0 +1,1 @@
+"""Jobs: work in processes of its own, since Taichi frees no field; here or on a cluster."""
