@@ -34,17 +34,17 @@ before = simulation.diagnostics()
 frame_interval = scene.frame_interval
 for frame in range(1, round(seconds / frame_interval) + 1):
     if frame == 3:
-        simulation.wound(wall, radius)
-        simulation.move_tool(wall)
-        simulation.suck(rate=1e-6)  # m^3/s
+        simulation.wounds.open(wall, radius)
+        simulation.tool.move_to(wall)
+        simulation.suction.set(rate=1e-6)  # m^3/s
     if frame == 8:
-        simulation.clamp()
-        simulation.suck(rate=0.0)
+        simulation.wounds.close()
+        simulation.suction.set(rate=0.0)
     simulation.advance_to(frame * frame_interval)
     count = simulation.particles.copy_to(identity, position, velocity)
     # Draw position[:count], colour by velocity[:count], follow particles by identity[:count],
-    # draw simulation.drops() outside; feed the hand with the force:
-    force = simulation.take_force()
+    # draw simulation.outlets.droplets() outside; feed the hand with the force:
+    force = simulation.tool.take_force()
     figures = simulation.diagnostics()
     events = {
         "bled": figures.bled_volume - before.bled_volume,

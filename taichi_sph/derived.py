@@ -58,10 +58,10 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
             flow += float(np.abs(wave * (table.flow or 0.0)).max())
     jet = math.sqrt(2.0 * (head + (highest - lowest) / scene.blood.density))
     squeezed = 0.0
-    pulse = read_wall_motion(scene, vessel)
-    if pulse is not None:
+    motion = read_wall_motion(scene, vessel)
+    if motion is not None:
         area = sum(opening.area for opening in vessel.openings if opening.is_open)
-        speed = pulse.swing * pulse.fastest
+        speed = motion.amplitude * motion.peak_rate
         squeezed = 2.0 * vessel.wall_area * speed / area if area else speed
     if flow > 0.0:
         jet = max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))

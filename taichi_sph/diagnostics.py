@@ -1,4 +1,4 @@
-"""What a frame says about the state of the blood."""
+"""Diagnostics: what a frame says about the state of the blood, and why a run had to stop."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ FEW = 0.2
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Figures of one frame."""
+    """Diagnostics of one frame."""
 
     time: float
     """Simulated time [s]."""
@@ -26,7 +26,7 @@ class Diagnostics:
     leaks: int
     """Particles outside the lumen that no opening explains, with those lost for good."""
     wall_corrections: int
-    """How often the wall's last defence has acted since the start."""
+    """How often blood was kept from passing the wall since the start, see `kick_drift`."""
     compression_p99: float
     """99th percentile of max(rho/rho_0 - 1, 0)."""
     compression_max: float
@@ -38,11 +38,11 @@ class Diagnostics:
     fallback_share: float
     """Part of the simulated time in which the model fell back to the physics."""
     added_volume: float = 0.0
-    """Volume that pistons have added [m^3]."""
+    """Volume that was driven in [m^3]."""
     bled_volume: float = 0.0
     """Volume that has left through wounds [m^3]."""
     sucked_volume: float = 0.0
-    """Volume that suction has taken [m^3]."""
+    """Volume that was aspirated [m^3]."""
 
 
 def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]:
@@ -62,16 +62,16 @@ def diagnose(
     bled: int = 0,
     sucked: int = 0,
 ) -> Diagnostics:
-    """Figures of a simulation, ours or one that is read as ours is.
+    """Diagnostics of a simulation, ours or one that is read as ours is.
 
     Args:
         simulation: what moves the blood.
-        density: of the live blood [kg/m^3], (n,).
+        density: of the live blood, rho [kg/m^3], (n,).
         drained: particles that have left, by opening.
         leaks: particles outside the lumen that no opening explains.
-        added: particles that pistons have added.
+        added: particles that were driven in.
         bled: particles that have left through wounds.
-        sucked: particles that suction has taken.
+        sucked: particles that were aspirated.
     """
     volume = simulation.particles.mass / simulation.scene.blood.density
     rest_density = simulation.scene.blood.density
@@ -95,3 +95,35 @@ def diagnose(
         max_speed=float(np.sqrt(speed2.max(initial=0.0))),
         fallback_share=simulation.fallback_share,
     )
+
+
+def describe_divergence(simulation: Any, broken: int) -> str:
+    """One sentence on a run that has to stop: which particle, when, and why, as far as can be told.
+
+    Args:
+        simulation: whose blood is too fast or not finite.
+        broken: particles that are not finite.
+    """
+    particles, neighbors = simulation.particles, simulation.neighbors
+    rows = particles.rows()
+    velocity, identity = rows["velocity"], rows["identity"]
+    at = f"at t = {simulation.time:.6g} s, step {simulation.steps}"
+    if broken:
+        finite = [np.isfinite(a).all(axis=1) for a in (velocity, rows["acceleration"])]
+        row = int(np.flatnonzero(~(finite[0] & finite[1]))[0])
+        what = f"particle {identity[row]} is not finite ({broken} in all) {at}"
+    else:
+        speed = np.linalg.norm(velocity, axis=1)
+        row = int(speed.argmax())
+        what = (
+            f"particle {identity[row]} moves at {speed[row]:.3g} m/s, above the limit of "
+            f"{simulation.speed_limit:.3g} m/s, {at}"
+        )
+    place = ", ".join(f"{c:.4g}" for c in rows["position"][row])
+    if simulation.as_printed:
+        cause = "the printed integrator (Eq. 18) amplifies sound; use integrator = 'symplectic'"
+    elif neighbors.blood_count[row] == 0 and neighbors.wall_count[row] == 0:
+        cause = "it has no neighbours, so it was thrown out earlier: a smaller spacing may help"
+    else:
+        cause = "the sound speed is too low for these speeds, or particles began too close"
+    return f"the run diverged: {what}, near ({place}) m; likely cause: {cause}"

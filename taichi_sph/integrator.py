@@ -1,8 +1,9 @@
-"""Kick, drift, and the last defence of the wall."""
+"""Kick and drift: symplectic Euler, and the correction of blood that would pass the wall."""
+
+from typing import Any
 
 import taichi as ti
 
-from taichi_sph.boundary.inflow import BufferRegions
 from taichi_sph.particles.wall import wall_velocity
 
 WALL_MARGIN = 0.1
@@ -11,15 +12,6 @@ WALL_MARGIN = 0.1
 WALL_SIDE = 0.5
 """A proxy guards only blood that was on its side before the step, to this depth [setbacks]:
 behind a thin septum lies another branch, whose blood must not be pulled over."""
-
-
-class NoPlugs:
-    """Nothing drives blood."""
-
-    gates = BufferRegions()
-
-
-NO_PLUGS = NoPlugs()
 
 
 @ti.func
@@ -35,7 +27,10 @@ def is_finite(a):
 
 @ti.kernel
 def largest_speed_and_acceleration(p: ti.template()) -> ti.math.vec3:
-    """Largest speed [m/s], largest acceleration [m/s^2], number of non-finite particles."""
+    """Largest speed [m/s], largest acceleration [m/s^2], number of non-finite particles.
+
+    Reads: velocity, acceleration.
+    """
     speed2 = 0.0
     acceleration2 = 0.0
     broken = 0.0
@@ -49,28 +44,35 @@ def largest_speed_and_acceleration(p: ti.template()) -> ti.math.vec3:
     return ti.Vector([ti.sqrt(speed2), ti.sqrt(acceleration2), broken])
 
 
+def has_buffers(inflow: Any) -> bool:
+    """Whether anything drives blood in, asked when `kick_drift` is compiled."""
+    return inflow is not None and inflow.regions.count > 0
+
+
 @ti.kernel
 def kick_drift(
     p: ti.template(),
     w: ti.template(),
     nb: ti.template(),
-    plugs: ti.template(),
-    printed: ti.template(),
+    inflow: ti.template(),
+    as_printed: ti.template(),
     dt: float,
 ) -> ti.math.vec2:
     """Advance velocity and position by dt [s], then keep blood inside the wall.
 
-    v' = v + a dt (Eq. 17), x' = x + v' dt: symplectic Euler.  `printed` takes Eq. 18 as printed,
+    v' = v + a dt (Eq. 17), x' = x + v' dt: symplectic Euler.  `as_printed` takes Eq. 18 as printed,
     x' = x + (v + v')/2 dt, which amplifies sound at every step (determinant 1 + (w dt)^2/2).
 
-    The wall's last defence: blood that comes nearer to the lumen surface than WALL_MARGIN
+    Wall penetration correction: blood that comes nearer to the lumen surface than WALL_MARGIN
     setbacks is put back on that distance along the normal of the proxies beside it, and its
     velocity into the wall is taken away.  The pressure of the wall holds blood that is packed;
-    this holds a lone drop, which has no pressure.  Blood of a plug moves with it, and no wall stops
-    it (see `taichi_sph.boundary.inflow`).
+    this holds a lone droplet, which has no pressure.
+
+    Blood in a buffer of `inflow` (the `BufferZones`, or None) moves with it, and no wall stops it.
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.
+    Reads: acceleration, wall, lists.  Writes: velocity, position.
     """
     moved2 = 0.0
     corrected = 0.0
@@ -79,15 +81,15 @@ def kick_drift(
         v_new = v + p.acceleration[i] * dt
         x = p.position[i]
         x_old = x
-        if ti.static(printed):
+        if ti.static(as_printed):
             x += 0.5 * (v + v_new) * dt
         else:
             x += v_new * dt
         walls = nb.wall_count[i]
-        if ti.static(plugs.gates.count > 0):
-            plug = plugs.gates.buffer_at(x_old)
-            if plug >= 0:
-                v_new = plugs.speed[plug] * plugs.gates.inward_normal(plug)
+        if ti.static(has_buffers(inflow)):
+            buffer = inflow.regions.buffer_at(x_old)
+            if buffer >= 0:
+                v_new = inflow.speed[buffer] * inflow.regions.inward_normal(buffer)
                 x = x_old + v_new * dt
                 walls = 0
         near2 = ti.static((0.75 * w.spacing) ** 2)

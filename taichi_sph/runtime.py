@@ -5,6 +5,8 @@ import contextlib
 import os
 import shutil
 import tempfile
+import threading
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,61 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taichi_sph.errors import InputError
+from taichi_sph.errors import InputError, RunError
 from taichi_sph.system import pin, processors
 from taichi_sph.system import threads as known_threads
 
 ARCHITECTURES = ("cpu", "gpu")
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+
+
+@dataclass(frozen=True)
+class _Started:
+    """The last `start`: fields live from one to the next, in its process."""
+
+    number: int
+    process: int
+    thread: int
+
+
+_started: _Started | None = None
+
+
+def runtime_number() -> int:
+    """Number of the last `start`, for whoever makes fields; they must be made in its thread.
+
+    Raises:
+        RunError: Taichi was not started, or in another process or thread.
+    """
+    if _started is None:
+        raise RunError("call taichi_sph.start() first: nothing can be computed before it")
+    require_runtime(_started.number)
+    if threading.get_ident() != _started.thread:
+        raise RunError(
+            "start() was called in another thread: make simulations and models in the thread that "
+            "called start(); they may be run in any"
+        )
+    return _started.number
+
+
+def require_runtime(number: int) -> None:
+    """Refuse fields that were made after another `start`, or before this process was forked.
+
+    Taichi would read freed memory, or wait for ever for threads that a fork does not copy.
+
+    Raises:
+        RunError: why they are of no use here.
+    """
+    if _started is None or number != _started.number:
+        raise RunError(
+            "this simulation was made before the last start(), which freed its fields; make it "
+            "again after start()"
+        )
+    if os.getpid() != _started.process:
+        raise RunError(
+            "this process was forked after start(), and Taichi's threads were not copied; fork "
+            "before start(), or use multiprocessing's method 'spawn'"
+        )
 
 
 def float_dtype() -> type[np.floating]:
@@ -108,11 +159,16 @@ def start(
 
     Raises:
         InputError: an unknown architecture or precision, no GPU, or no folder for kernels.
+        RunError: this process was forked after Taichi was started.
     """
+    global _started
     if arch not in ARCHITECTURES:
         raise InputError(f"--arch {arch}: allowed are {', '.join(ARCHITECTURES)}")
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: allowed are {', '.join(PRECISIONS)}")
+    if _started is not None:
+        require_runtime(_started.number)
+    number = _started.number + 1 if _started is not None else 1
     options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
     folder = _kernel_cache()
     if folder is not None:
@@ -133,6 +189,7 @@ def start(
             offline_cache=True,
             **options,
         )
+    _started = _Started(number, os.getpid(), threading.get_ident())
     if arch == "cpu":
         _pin(sorted(known_threads() - others)[-ti.cfg.cpu_max_num_threads :])
     if arch == "gpu" and ti.cfg.arch in (ti.x64, ti.arm64):

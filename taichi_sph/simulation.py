@@ -1,214 +1,190 @@
-"""Simulation: the blood of a scene in its vessel."""
+"""Simulation: blood, the model of its accelerations and its boundaries, advanced step by step."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from taichi_sph.boundary.inflow import (
-    LEAST_APART,
-    BufferZones,
-    DrivenOpening,
-    add_blood,
-    buffer_sites,
-    flow_extension,
-)
+from taichi_sph.assemble import Assembly, assemble
+from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.inflow import BufferZones
 from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION, Outlets
-from taichi_sph.boundary.surgery import MOST_WOUNDS, Surgery, Wound
-from taichi_sph.boundary.tool import Tool, read_shape
-from taichi_sph.boundary.wall_motion import read_wall_motion
-from taichi_sph.derived import Derived, derive
-from taichi_sph.diagnostics import Diagnostics, diagnose
+from taichi_sph.boundary.suction import Suction
+from taichi_sph.boundary.tool import Tool
+from taichi_sph.boundary.wall_motion import MovingWall
+from taichi_sph.boundary.wounds import Wounds
+from taichi_sph.derived import Derived
+from taichi_sph.diagnostics import Diagnostics, describe_divergence, diagnose
 from taichi_sph.errors import InputError, RunError
-from taichi_sph.fluid.calibration import calibrate
-from taichi_sph.fluid.equation_of_state import Tait
-from taichi_sph.fluid.rheology import make_rheology
-from taichi_sph.fluid.wcsph import AccelerationModel, Fluid, SphAcceleration, force_on_tool
+from taichi_sph.fluid.wcsph import AccelerationModel, Fluid, SphAcceleration
 from taichi_sph.geometry.vessel import Vessel, read_vessel
-from taichi_sph.motion import Motion
-from taichi_sph.particles.neighbors import Neighbors, cells_within, make_grid
-from taichi_sph.particles.particles import Particles
-from taichi_sph.particles.smoothing_kernel import WendlandC2
-from taichi_sph.particles.wall import Wall
-from taichi_sph.runtime import float_dtype
+from taichi_sph.integrator import kick_drift, largest_speed_and_acceleration
+from taichi_sph.runtime import require_runtime, runtime_number
 from taichi_sph.scene import Scene
-from taichi_sph.waveform import read_waveform
+from taichi_sph.state import State
 
 ModelFactory = Callable[[Fluid, int], AccelerationModel]
 """Makes a model for a fluid and a number of particles."""
 
-SKIN = 0.1
-"""Skin of the neighbour lists over the support radius: a wider one is built less often and holds
-more candidates; from 0.12 on (2.24 d) it holds the lattice's next shell.  Of 0.02 to 0.3, PcNet
-pours A fastest with 0.1 and the physics, whose steps are short, is 7 % faster with 0.05 to 0.08."""
+AnyBoundary = TypeVar("AnyBoundary", bound=Boundary)
 
-OPENING_REACH = 2.5
-"""Blood beyond an opening's plane has left by it within this many radii of its centre."""
-
-DROP_TIME = 0.3
-"""Drops that have left through a wound are shown for this long [s]: they fall 0.4 m."""
+SAME_TIME = 1e-12
+"""Times that differ by less, relatively, are the same: sums of steps round."""
 
 
-@dataclass(frozen=True)
-class State:
-    """All that changes from step to step; rows in the order of the grid."""
+class Simulation:
+    """Blood in a box, or in the vessel of a scene, and what moves it.
 
-    time: float
-    """[s]"""
-    last_step: float
-    """[s]"""
-    fallback_time: float
-    """[s]"""
-    steps: int
-    wall_corrections: int
-    controls: dict[str, Any]
-    """What was done to the run: gravity, wounds, tool, pistons; numbers, lists and names only."""
-    removed: np.ndarray
-    """Particles that have left by each place of the account, see `taichi_sph.boundary.outlets`."""
-    identity: np.ndarray
-    """(n,)"""
-    position: np.ndarray
-    """[m], (n, 3)."""
-    velocity: np.ndarray
-    """[m/s], (n, 3)."""
-    acceleration: np.ndarray
-    """[m/s^2], (n, 3)."""
-    density: np.ndarray
-    """[kg/m^3], (n,)."""
-
-
-class Simulation(Motion):
-    """Blood of a scene in its vessel."""
+    Validation flows and tests make it of parts, without boundaries; `from_scene` of a scene.
+    """
 
     def __init__(
         self,
-        scene: Scene,
-        vessel: Vessel,
-        make_model: ModelFactory = SphAcceleration,
-        seed: int = 0,
+        blood: BloodFlow,
+        model: AccelerationModel,
+        boundaries: Sequence[Boundary] = (),
+        *,
+        speed_limit: float,
+        integrator: str = "symplectic",
+        assembly: Assembly | None = None,
     ):
-        """Sample the wall, fill the column and set up the model (the physics by default).
+        """Put the parts together.
 
-        Raises:
-            InputError: the column does not fit the vessel.
+        Args:
+            blood: to be moved, with its wall.
+            model: of the accelerations.
+            boundaries: in the order in which they are to be asked.
+            speed_limit: a higher speed [m/s] ends the run.
+            integrator: "symplectic", or "paper" for Eqs. 17 and 18 as printed.
+            assembly: what it is assembled from, of a scene.
         """
-        grid = scene.discretization
-        kernel = WendlandC2(grid.support_ratio * grid.spacing)
-        wall_spacing = grid.wall_spacing_ratio * grid.spacing
-        calibration = calibrate(kernel, grid.spacing, wall_spacing, scene.blood.density)
-        setback = calibration.setback
-        self.scene = scene
-        self.vessel = vessel
-        plugs = BufferZones(
-            make_pistons(scene, vessel), grid.spacing, kernel.support_radius, scene.blood.density
-        )
-        self.pulse = read_wall_motion(scene, vessel)
-        sample = vessel.sample_wall(wall_spacing, setback, seed)
-        proxies, normals = [sample.positions], [sample.normals]
-        swings = [np.zeros(len(sample.positions))]
-        if self.pulse is not None:
-            swings = [self.pulse.reach(vessel, sample.positions - setback * sample.normals)]
-        for piston in plugs.each:
-            rim = vessel.rim(vessel.openings.index(piston.opening))
-            tube = flow_extension(rim, piston.opening, wall_spacing, setback, plugs.gates.depth)
-            proxies.append(tube[0])
-            normals.append(tube[1])
-            swings.append(np.zeros(len(tube[0])))
-        tool = make_tool(scene, vessel, wall_spacing, setback, kernel)
-        column = vessel.fill_column(scene.column, grid.spacing)
-        if tool.shape is not None and len(column):
-            about = column - tool.position
-            clear = tool.shape.distance(about) > 0.5 * grid.spacing
-            column = column[clear & tool.shape.clear_of(about)]
-        blood = np.concatenate([column, plugs.initial_blood(column)])
-        # What flows in may fill the vessel, at its widest, and pack it closer than the lattice did.
-        room = 0
-        if plugs.each:
-            widest = vessel.volume
-            if self.pulse is not None:
-                widest += vessel.wall_area * self.pulse.swing
-            full = widest / grid.spacing**3 + plugs.capacity
-            room = max(0, math.ceil(1.1 * full) - len(blood))
-        self._initial = blood
-        self.derived: Derived = derive(scene, vessel, len(blood), sum(map(len, proxies)))
-        self.fluid = Fluid(
-            kernel=kernel,
-            equation_of_state=Tait(scene.blood.density, self.derived.sound_speed),
-            rheology=make_rheology(scene.blood.rheology),
-            calibration=calibration,
-            artificial_viscosity=scene.blood.artificial_viscosity,
-            courant_number=grid.courant_number,
-            nested=grid.viscous_form == "nested",
-        )
-        particles = Particles.from_numpy(
-            blood, mass=scene.blood.density * grid.spacing**3, room=room
-        )
-        wall = Wall.from_numpy(
-            np.concatenate(proxies), np.concatenate(normals), kernel, setback, wall_spacing,
-            tool=tool.count, swing=np.concatenate(swings),
-        )  # fmt: skip
-        skin = SKIN * kernel.support_radius
-        margin = 2.0 * (kernel.support_radius + skin) + wall.most_swing
-        margin += plugs.gates.depth if plugs.each else 0.0
-        lower, upper = vessel.vertices.min(axis=0) - margin, vessel.vertices.max(axis=0) + margin
-        cells = make_grid(lower, upper, kernel.support_radius + skin + 0.5 * wall.most_swing)
-        neighbors = Neighbors.allocate(
-            cells,
-            kernel.support_radius,
-            skin,
-            particles.capacity,
-            grid.spacing,
-            wall,
-            # The wall's proxies, and blood that leaves through an opening, are within this.
-            cells_within(cells, vessel.signed_distance, margin),
-        )
-        super().__init__(
-            particles,
-            wall,
-            neighbors,
-            make_model(self.fluid, particles.capacity),
-            scene.gravity,
-            # Faster than sound the equation of state means nothing.
-            speed_limit=self.derived.sound_speed,
-            integrator=grid.integrator,
-        )
-        if plugs.each:
-            self.plugs = plugs
-        self._pistons = plugs
-        self.exits = Outlets(len(vessel.openings) + MOST_WOUNDS)
-        for k, opening in enumerate(vessel.openings):
-            if opening.is_open:
-                driven = scene.openings[opening.name].driven
-                beyond = (plugs.far_end if driven else 0.0) * opening.normal
-                self.exits.open(
-                    k, opening.centre + beyond, opening.centre + beyond, opening.normal,
-                    OPENING_REACH * opening.radius,
-                )  # fmt: skip
-        self.surgery = Surgery(
-            vessel, wall, neighbors, self.exits, len(vessel.openings), kernel, grid.spacing, tool
-        )
-        self.added = 0
-        """Particles that pistons have added."""
-        self._next_identity = len(blood)
-        self._impulse = np.zeros(3)
-        self._impulse_time = 0.0
+        self.blood = blood
+        self.particles, self.wall, self.neighbors = blood.particles, blood.wall, blood.neighbors
+        self.model = model
+        self.boundaries = tuple(boundaries)
+        self.speed_limit = speed_limit
+        self.as_printed = integrator == "paper"
+        self.steps = 0
+        self.last_step = 0.0
+        """[s]"""
+        self.wall_corrections = 0
+        """How often blood was kept from passing the wall, see `kick_drift`."""
+        self.fallback_time = 0.0
+        """Simulated time for which the model fell back to the physics [s]."""
+        self.step_limit = math.inf
+        """Longest step allowed beside the model's own limit [s]."""
+        self._assembly = assembly
+        self._inflow = self._find(BufferZones)
+        self._runtime = runtime_number()
 
     @classmethod
     def from_scene(
-        cls, scene: Scene, make_model: ModelFactory = SphAcceleration, seed: int = 0
-    ) -> "Simulation":
-        """Read the vessel of a scene and set everything up.
+        cls, scene: Scene, make_model: ModelFactory = SphAcceleration, seed: int = 0,
+        vessel: Vessel | None = None,
+    ) -> "Simulation":  # fmt: skip
+        """Read the vessel of a scene, unless it is given, and set everything up.
 
         Raises:
             InputError: the surface cannot be used, or the column does not fit.
+            RunError: Taichi was not started, or in another thread.
         """
-        return cls(scene, read_vessel(scene), make_model, seed)
+        runtime_number()
+        parts = assemble(scene, read_vessel(scene) if vessel is None else vessel, seed)
+        return cls(
+            parts.blood,
+            make_model(parts.fluid, parts.blood.particles.capacity),
+            parts.boundaries,
+            # Faster than sound the equation of state means nothing.
+            speed_limit=parts.derived.sound_speed,
+            integrator=scene.discretization.integrator,
+            assembly=parts,
+        )
 
-    def place(self, position: np.ndarray, velocity: np.ndarray) -> None:
+    # A step
+
+    def step(self, remaining: float) -> None:
+        """Advance by one step of at most `remaining` seconds.
+
+        Raises:
+            RunError: a state that is not finite, too fast, or clumped; too much blood driven in.
+        """
+        self._require_runtime()
+        p, w, nb = self.particles, self.wall, self.neighbors
+        if nb.stale:
+            self.rebuild_lists()
+        self.model.accelerate(p, w, nb, self.gravity)
+        dt = self._choose_step(remaining)
+        wall_moved = sum(b.before_drift(dt, self.model) for b in self.boundaries)
+        blood_moved2, corrected = kick_drift(p, w, nb, self._inflow, self.as_printed, dt)
+        nb.note_drift(math.sqrt(blood_moved2), wall_moved)
+        self._count_step(dt, int(corrected))
+
+    def rebuild_lists(self) -> None:
+        """Let boundaries add and remove blood, and build the lists for it as it stands.
+
+        Raises:
+            RunError: too much blood is driven in, or particles have clumped.
+        """
+        self._require_runtime()
+        for boundary in self.boundaries:
+            boundary.before_lists()
+        self.neighbors.build(self.particles, self.wall)
+
+    def _choose_step(self, remaining: float) -> float:
+        """The next step [s], under the accelerations that there are.
+
+        Raises:
+            RunError: they or the velocities are not finite, or blood is too fast.
+        """
+        speed, acceleration, broken = largest_speed_and_acceleration(self.particles)
+        if broken or speed > self.speed_limit:
+            raise RunError(describe_divergence(self, int(broken)))
+        stable = min(self.model.stable_step(speed, acceleration), self.step_limit)
+        # Equal steps to the end of the frame, so that none is a sliver.
+        return remaining / max(1, math.ceil(remaining / stable * (1.0 - 1e-9)))
+
+    def _count_step(self, dt: float, corrected: int) -> None:
+        self.wall_corrections += corrected
+        self.last_step = dt
+        self.fallback_time += dt * self.model.used_fallback
+        self.time += dt
+        self.steps += 1
+
+    def advance_to(
+        self, time: float, before_step: Callable[[], None] | None = None,
+        after_step: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
+        """Step until a simulated time [s]; the two are called before and after each step.
+
+        Raises:
+            InputError: the time is past, or no time.
+            RunError: as `step`.
+        """
+        self._require_runtime()
+        self._require_future(time)
+        while self.time < time * (1.0 - SAME_TIME):
+            if before_step is not None:
+                before_step()
+            if self.particles.count[None] == 0:
+                break
+            self.step(time - self.time)
+            if after_step is not None:
+                after_step()
+        self.time = time
+
+    def _require_future(self, time: float) -> None:
+        if isinstance(time, bool) or not isinstance(time, int | float | np.number):
+            raise InputError(f"advance_to: {time!r} is no time; allowed: a number of seconds")
+        if not math.isfinite(time) or time < self.time * (1.0 - SAME_TIME):
+            raise InputError(
+                f"advance_to: {time:g} s is not ahead; blood is at {self.time:g} s and flows "
+                "forward only; allowed: that time or a later one"
+            )
+
+    # The state
+
+    def restart_with(self, position: np.ndarray, velocity: np.ndarray) -> None:
         """Begin again, at time zero, with other blood.
 
         Args:
@@ -216,37 +192,49 @@ class Simulation(Motion):
             velocity: [m/s], (n, 3).
 
         Raises:
-            InputError: there is no room for so many.
+            InputError: there is no room for so many, or a number is not finite.
         """
+        self._require_blood(position, velocity)
+        self.time = self.last_step = self.fallback_time = 0.0
+        self.steps = self.wall_corrections = 0
+        self._reset(position, velocity)
+
+    def reset(self) -> None:
+        """Put blood, boundaries and gravity back to the start; clock and steps go on."""
+        self.gravity = self.scene.gravity
+        blood = self._require_assembly().initial_blood
+        self._reset(blood, np.zeros_like(blood))
+
+    def _reset(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """All but gravity as at the start, with such blood, whatever the clock says."""
+        self.set_blood(np.arange(len(position)), position, velocity)
+        for boundary in self.boundaries:
+            boundary.reset()
+
+    def set_blood(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Replace the blood: identities (n,), positions [m] and velocities [m/s], (n, 3).
+
+        What else a particle has is zero.
+
+        Raises:
+            InputError: there is no room for so many, or a number is not finite.
+        """
+        self._require_blood(position, velocity)
+        self.particles.replace({"identity": identity, "position": position, "velocity": velocity})
+        self.neighbors.stale = True
+
+    def _require_blood(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        self._require_runtime()
         if len(position) > self.particles.capacity:
             raise InputError(
                 f"{len(position)} particles: there is room for {self.particles.capacity}, those of "
                 "the scene's column"
             )
-        self.time = self.last_step = self.fallback_time = 0.0
-        self.steps = self.wall_corrections = 0
-        self._start_again(position, velocity)
-
-    def reset(self) -> None:
-        """Blood, pistons, wounds, tool and gravity as at the start; clock and steps go on."""
-        self.gravity = self.scene.gravity
-        self._start_again(self._initial, np.zeros_like(self._initial))
-
-    def _start_again(self, position: np.ndarray, velocity: np.ndarray) -> None:
-        """All but gravity as at the start, with such blood, whatever the clock says."""
-        self.put(np.arange(len(position)), position, velocity)
-        self.particles.acceleration.fill(0.0)
-        self.exits.removed.fill(0)
-        self.added, self._next_identity = 0, len(position)
-        for piston in self.pistons:
-            piston.start_again()
-        self.surgery.start_again(self.time)
-        self._pulse_until(self.time)
-
-    def put(self, identity: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Replace the blood: identities (n,), positions [m] and velocities [m/s], (n, 3)."""
-        self.particles.replace(identity=identity, position=position, velocity=velocity)
-        self._stale = True
+        for name, values in (("position", position), ("velocity", velocity)):
+            finite = np.isfinite(np.asarray(values, float)).reshape(len(position), -1).all(axis=1)
+            if not finite.all():
+                row = int(np.flatnonzero(~finite)[0])
+                raise InputError(f"{name}: row {row} is {values[row]}; allowed: finite numbers")
 
     def save_state(self) -> State:
         """A copy of the state; the lists are built anew at the next step.
@@ -254,84 +242,173 @@ class Simulation(Motion):
         A simulation that goes on from the copy builds them too: both then add up in the same order
         and stay bitwise alike on the CPU.
         """
-        p, n = self.particles, self.particles.count[None]
-        self._stale = True
-        controls = {
-            "model": self.model.name,
-            "gravity": list(self.gravity),
-            "added": self.added,
-            "next_identity": self._next_identity,
-            "pistons": [piston.state() for piston in self._pistons.each],
-            "wall": [self.wall.level, self.wall.rate],
-            **self.surgery.state(),
-        }
+        self._require_runtime()
+        self.neighbors.stale = True
         return State(
             self.time, self.last_step, self.fallback_time, self.steps, self.wall_corrections,
-            controls, self.exits.account(),
-            *(
-                field.to_numpy()[:n]
-                for field in (p.identity, p.position, p.velocity, p.acceleration, p.density)
-            ),
+            self.model.name, self.gravity,
+            {boundary.name: boundary.save_state() for boundary in self.boundaries},
+            self.particles.rows(),
         )  # fmt: skip
 
     def load_state(self, state: State) -> None:
-        """Go on from a state of the same scene, under the model that it names.
+        """Go on from a state of the same scene, under a model of the name that it has.
 
         Raises:
-            InputError: it is of another number of openings, or there is no room for so many.
+            InputError: it is of other boundaries, or there is no room for so many.
         """
-        n, p = len(state.identity), self.particles
-        if n > p.capacity or state.removed.shape != self.exits.account().shape:
+        self._require_runtime()
+        n, capacity = len(state.particles["identity"]), self.particles.capacity
+        unknown = state.boundaries.keys() - {boundary.name for boundary in self.boundaries}
+        if n > capacity or unknown:
             raise InputError(
-                f"a state of {n} particles and an account of {len(state.removed)} places: the "
-                f"scene has {p.capacity} and {len(self.exits.account())}"
+                f"a state of {n} particles with {', '.join(unknown) or 'nothing'} that the scene "
+                f"has not; there is room for {capacity}"
             )
-        p.replace(
-            identity=state.identity,
-            position=state.position,
-            velocity=state.velocity,
-            acceleration=state.acceleration,
-            density=state.density,
-        )
-        self.exits.removed.from_numpy(state.removed)
+        self.particles.replace(state.particles)
         self.time, self.last_step, self.fallback_time = (
             state.time, state.last_step, state.fallback_time
         )  # fmt: skip
         self.steps, self.wall_corrections = state.steps, state.wall_corrections
-        controls = state.controls
-        x, y, z = controls["gravity"]
-        self.gravity = (x, y, z)
-        self.added, self._next_identity = controls["added"], controls["next_identity"]
-        for piston, row in zip(self._pistons.each, controls["pistons"], strict=True):
-            piston.load_state(row)
-        self.surgery.load_state(controls)
-        self.neighbors.move_wall(self.wall, *controls["wall"])
-        self._stale = True
+        self.gravity = state.gravity
+        self.neighbors.stale = True
+        for boundary in self.boundaries:
+            if boundary.name in state.boundaries:
+                boundary.load_state(state.boundaries[boundary.name])
+            else:
+                boundary.reset()  # the state is older than this kind of boundary
+
+    # Models
 
     def use_model(self, model: AccelerationModel) -> None:
         """Let another model, made by `make_model`, compute accelerations from now on."""
         self.model = model
 
     def make_model(self, make_model: ModelFactory) -> AccelerationModel:
-        """A model for this simulation; its fields stay in memory for good."""
+        """A model for this simulation; its fields stay in memory for good.
+
+        Raises:
+            RunError: this is not the thread that called `start`.
+        """
+        self._require_runtime()
+        runtime_number()
         return make_model(self.fluid, self.particles.capacity)
 
-    def compile_kernels(self, models: list[AccelerationModel]) -> None:
-        """Have models compile what they need, before anybody waits for it; nothing moves."""
+    def compile_kernels(self, models: Sequence[AccelerationModel]) -> None:
+        """Have models and boundaries compile what they need, before anybody waits for it.
+
+        Nothing moves.
+        """
+        self._require_runtime()
         self.neighbors.build(self.particles, self.wall)
         for model in models:
             acceleration = self.particles.acceleration.to_numpy()
             model.accelerate(self.particles, self.wall, self.neighbors, self.gravity)
             self.particles.acceleration.from_numpy(acceleration)
-            if self.wall.tool and model.pair_coefficients is not None:
-                force_on_tool(self.particles, self.wall, self.neighbors, *model.pair_coefficients)
-        self.surgery.compile_kernels(self.particles)
-        self._stale = True
+            for boundary in self.boundaries:
+                boundary.compile_kernels(model)
+        self.neighbors.stale = True
+
+    # Boundaries by name
 
     @property
-    def pistons(self) -> list[DrivenOpening]:
-        """What drives the openings."""
-        return self._pistons.each
+    def outlets(self) -> Outlets:
+        """Where blood leaves, how much has left, and droplets that fall."""
+        return self.boundary(Outlets)
+
+    @property
+    def inflow(self) -> BufferZones:
+        """What drives blood through openings."""
+        return self.boundary(BufferZones)
+
+    @property
+    def wounds(self) -> Wounds:
+        """Wounds: open and close them."""
+        return self.boundary(Wounds)
+
+    @property
+    def suction(self) -> Suction:
+        """Suction at the tool's tip: set its rate."""
+        return self.boundary(Suction)
+
+    @property
+    def tool(self) -> Tool:
+        """The tool: move it, take its force."""
+        return self.boundary(Tool)
+
+    @property
+    def wall_motion(self) -> MovingWall | None:
+        """What moves the vessel's wall; None where it stands still."""
+        return self._find(MovingWall)
+
+    def boundary(self, kind: type[AnyBoundary]) -> AnyBoundary:
+        """The boundary of a kind.
+
+        Raises:
+            LookupError: there is none, as without a scene.
+        """
+        boundary = self._find(kind)
+        if boundary is None:
+            raise LookupError(f"this simulation has no {kind.__name__}")
+        return boundary
+
+    def _find(self, kind: type[AnyBoundary]) -> AnyBoundary | None:
+        return next((b for b in self.boundaries if isinstance(b, kind)), None)
+
+    # What it is of
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that it was made from."""
+        return self._require_assembly().scene
+
+    @property
+    def vessel(self) -> Vessel:
+        """The vessel of the scene."""
+        return self._require_assembly().vessel
+
+    @property
+    def derived(self) -> Derived:
+        """Numbers that follow from the scene."""
+        return self._require_assembly().derived
+
+    @property
+    def fluid(self) -> Fluid:
+        """Constants of the blood."""
+        return self._require_assembly().fluid
+
+    def _require_assembly(self) -> Assembly:
+        if self._assembly is None:
+            raise LookupError("this simulation was made of parts: it has no scene and no vessel")
+        return self._assembly
+
+    def _require_runtime(self) -> None:
+        require_runtime(self._runtime)
+
+    # What is read out
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.blood.time
+
+    @time.setter
+    def time(self, time: float) -> None:
+        self.blood.time = time
+
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """Body force per mass g [m/s^2]."""
+        return self.blood.gravity
+
+    @gravity.setter
+    def gravity(self, gravity: tuple[float, float, float]) -> None:
+        self.blood.gravity = gravity
+
+    @property
+    def fallback_share(self) -> float:
+        """Part of the simulated time in which the model fell back to the physics."""
+        return self.fallback_time / self.time if self.time else 0.0
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -339,95 +416,6 @@ class Simulation(Motion):
         grid = self.neighbors.grid
         low = np.array(grid.lower)
         return low, low + np.array(grid.cell) * np.array(grid.shape)
-
-    def drive(self, factor: float, opening: str | None = None) -> None:
-        """Multiply what drives an opening, or all, by a factor; it takes 0.05 s to get there.
-
-        Raises:
-            InputError: nothing drives that opening.
-        """
-        chosen = [p for p in self._pistons.each if opening in (None, p.opening.name)]
-        if not chosen:
-            names = ", ".join(p.opening.name for p in self._pistons.each) or "none"
-            raise InputError(f"inflow: nothing drives {opening or 'this scene'}; driven: {names}")
-        for piston in chosen:
-            piston.asked = factor
-
-    def wound(self, centre: np.ndarray, radius: float, end: np.ndarray | None = None) -> Wound:
-        """Open the wall: see `Surgery.wound`."""
-        self._stale = True
-        return self.surgery.wound(centre, radius, end)
-
-    def clamp(self, number: int | None = None) -> None:
-        """Close a wound, or all: see `Surgery.clamp`."""
-        self._stale = True
-        numbers = range(len(self.surgery.wounds)) if number is None else [number]
-        for each in numbers:
-            self.surgery.clamp(each, self.particles, self.time)
-
-    def suck(self, rate: float, radius: float | None = None) -> None:
-        """Suck away at most `rate` [m^3/s] of the blood within a radius [m] of the tool's tip."""
-        self.surgery.suction_rate = rate
-        self.surgery.suction_radius = radius or 2.0 * self.scene.discretization.spacing
-
-    def move_tool(self, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
-        """Say where the tool is wanted: position [m], rotation as a quaternion w, x, y, z."""
-        tool = self.surgery.tool
-        tool.wanted_position = np.asarray(position, float)
-        if rotation is not None:
-            tool.wanted_rotation = Rotation.from_quat(np.roll(rotation, -1))
-
-    def take_force(self) -> np.ndarray:
-        """Force of the blood on the tool, mean since this was last asked [N], (3,)."""
-        force = self._impulse / self._impulse_time if self._impulse_time else np.zeros(3)
-        self._impulse, self._impulse_time = np.zeros(3), 0.0
-        return force
-
-    def before_build(self) -> None:
-        """Add what pistons bring and mark what has left: by exits, by suction, out of the box.
-
-        Raises:
-            RunError: there is no room for so much blood.
-        """
-        self.exits.mark(self.particles, self.neighbors.grid, self.time)
-        self.surgery.before_build(self.particles, self.time)
-        position, velocity = self._pistons.new_blood()
-        if len(position):
-            room = self.particles.capacity - self.particles.count[None]
-            if room < len(position):
-                raise RunError(
-                    f"the run diverged: at t = {self.time:.6g} s the vessel is over-full, "
-                    f"{self.particles.capacity} particles; likely cause: more is driven in than "
-                    "can leave, or the pressure is too high for the sound speed"
-                )
-            added = add_blood(
-                self.particles, self._pistons.gates,
-                *(np.ascontiguousarray(a, float_dtype()) for a in (position, velocity)),
-                np.zeros(len(position), np.int32), self._next_identity,
-                (LEAST_APART * self.scene.discretization.spacing) ** 2,
-            )  # fmt: skip
-            self.added += added
-            self._next_identity += added
-
-    def before_drift(self, dt: float) -> None:
-        """Move plugs, tool and wall by a step of dt [s]."""
-        if self._pistons.each:
-            self._pistons.advance(self.particles, self.time, dt, self.gravity)
-        if self.wall.tool and self.model.pair_coefficients is not None:
-            force = force_on_tool(
-                self.particles, self.wall, self.neighbors, *self.model.pair_coefficients
-            )
-            self._impulse += dt * np.array([force[0], force[1], force[2]])
-            self._impulse_time += dt
-        self._wall_moved += self.surgery.before_drift(dt) + self._pulse_until(self.time + dt)
-
-    def _pulse_until(self, time: float) -> float:
-        """Put the wall where its pulse wants it at a time [s]; returns how far it has moved [m]."""
-        if self.pulse is None:
-            return 0.0
-        before = self.wall.level
-        self.neighbors.move_wall(self.wall, self.pulse.level(time), self.pulse.rate(time))
-        return self.wall.most_swing * abs(self.wall.level - before)
 
     def positions(self) -> np.ndarray:
         """Positions of the live blood [m], shape (n, 3), in order of identity."""
@@ -447,61 +435,22 @@ class Simulation(Motion):
         """Identities of the live blood, ascending, shape (n,)."""
         return self.particles.identities()
 
-    def drops(self) -> np.ndarray:
-        """Blood that has lately left through wounds, as it falls [m], (n, 3)."""
-        return self.exits.drops(self.time, np.asarray(self.gravity), DROP_TIME)
-
     def diagnostics(self) -> Diagnostics:
         """Figures of the present state; leaks are counted against the surface itself."""
-        account = self.exits.account()
+        self._require_runtime()
+        counts = self.outlets.outflow_counts()
         names = [o.name for o in self.vessel.openings]
-        exits = account[2:]
-        drained = {name: int(n) for name, n in zip(names, exits, strict=False)}
+        left = counts[2:]
+        drained = {name: int(n) for name, n in zip(names, left, strict=False)}
         density = self.particles.in_order(self.particles.density)
         x = self.positions()
         held = np.ones(len(x), bool)
-        for wound in self.surgery.wounds:
+        for wound in self.wounds:
             # Blood in the hole has not leaked.
             held &= wound.distance(x) > wound.radius + 3.0 * self.scene.discretization.spacing
-        swung = self.wall.level * self.wall.most_swing
-        leaks = self.vessel.count_leaks(x[held], swung) + int(account[OUT_OF_BOX])
+        widened = self.wall.displacement_factor * self.wall.largest_amplitude
+        leaks = self.vessel.count_leaks(x[held], widened) + int(counts[OUT_OF_BOX])
         return diagnose(
-            self, density, drained, leaks,
-            added=self.added, bled=int(exits[len(names) :].sum()), sucked=int(account[SUCTION]),
+            self, density, drained, leaks, added=self.inflow.added,
+            bled=int(left[len(names) :].sum()), sucked=int(counts[SUCTION]),
         )  # fmt: skip
-
-
-def make_pistons(scene: Scene, vessel: Vessel) -> list[DrivenOpening]:
-    """What drives the openings of a scene.
-
-    Raises:
-        InputError: a waveform that cannot be read, an opening too narrow for one particle.
-    """
-    pistons = []
-    for k, opening in enumerate(vessel.openings):
-        table = scene.openings[opening.name]
-        if table.driven:
-            sites = buffer_sites(vessel.rim(k), opening, scene.discretization.spacing)
-            if len(sites) == 0:
-                raise InputError(
-                    f"openings.{opening.name}: too narrow to be driven at spacing "
-                    f"{scene.discretization.spacing:g} m"
-                )
-            waveform = read_waveform(table.waveform, Path(scene.folder))
-            pistons.append(DrivenOpening(opening, table.flow, table.pressure, waveform, sites))
-    return pistons
-
-
-def make_tool(
-    scene: Scene, vessel: Vessel, spacing: float, setback: float, kernel: WendlandC2
-) -> Tool:
-    """The scene's tool or, without one, a point just inside the column's opening.
-
-    Raises:
-        InputError: its surface cannot be used.
-    """
-    if scene.tool is None:
-        opening = vessel.opening(scene.column.opening)
-        return Tool(None, opening.centre - opening.radius * opening.normal)
-    shape = read_shape(scene.tool, Path(scene.folder), spacing, setback, kernel)
-    return Tool(shape, np.array(scene.tool.position))

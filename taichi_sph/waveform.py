@@ -9,6 +9,10 @@ import numpy as np
 
 from taichi_sph.errors import InputError
 
+RAMP_TIME = 0.05
+"""Time in which a flow, a pressure or a wall's motion rises from nothing to what is asked for [s]:
+blood that is set going at once rings."""
+
 COMMON_CAROTID = (
     (3.294, -0.023974), (1.9262, -1.1801), (-1.4219, 0.92701), (-0.66627, -0.24118),
     (-0.33933, -0.27471), (-0.37914, -1.0557), (0.22396, 1.22), (0.1507, 1.0984),

@@ -81,7 +81,7 @@ def measure_overhead(
     spawn = multiprocessing.get_context("spawn")
     acting, done = spawn.Event(), spawn.Event()
     with closing(Channel(session)) as channel, closing(ControlPage(session, port=0)) as page:
-        place = [float(x) for x in simulation.surgery.tool.position]
+        place = [float(x) for x in simulation.tool.position]
         client = spawn.Process(
             target=_act, args=(channel.port, page.port, place, acting, done), daemon=True
         )

@@ -19,7 +19,7 @@ from nn.weights import Weights
 from taichi_sph import Simulation, start
 from taichi_sph.fluid.implicit import correct_pressure
 from taichi_sph.fluid.wcsph import sum_acceleration, sum_density
-from taichi_sph.integrator import NO_PLUGS, kick_drift, largest_speed_and_acceleration
+from taichi_sph.integrator import kick_drift, largest_speed_and_acceleration
 from taichi_sph.particles.neighbors import RUN, Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.scene import Scene
@@ -168,7 +168,7 @@ def measure_passes(
             p, w, nb, net.fluid, net.interval, net.response, net.physics.pressure_term
         ),
         "survey": lambda: largest_speed_and_acceleration(p),
-        "integration, wall": lambda: kick_drift(p, w, nb, NO_PLUGS, False, 0.0),
+        "integration, wall": lambda: kick_drift(p, w, nb, None, False, 0.0),
         "limit of arithmetic": lambda: multiply_add(numbers, sums),
         "limit of fetching": lambda: fetch(p, nb, sums),
     })  # fmt: skip

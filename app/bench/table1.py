@@ -116,7 +116,11 @@ def measure_scene(
 
     start(arch, threads=threads)
     vessel = read_vessel(scene)
-    sides = [Simulation(scene, vessel), Simulation(scene, vessel, load_pcnet(weights, scene))]
+    network = load_pcnet(weights, scene)
+    sides = [
+        Simulation.from_scene(scene, vessel=vessel),
+        Simulation.from_scene(scene, network, vessel=vessel),
+    ]
     frame = sides[1].model.stable_step(0.0, 0.0)
     block = FRAMES_A_BLOCK * frame
     if round(duration / block) < 2:

@@ -32,13 +32,13 @@ from app.view.appearance import (
     speed_levels,
     upward,
 )
-from taichi_sph.boundary.surgery import LEAST_RADIUS
+from taichi_sph.boundary.wounds import LEAST_RADIUS
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Floats, Integers
 
 if TYPE_CHECKING:
     from app.control.session import Picture, Session
-    from taichi_sph.boundary.surgery import Wound
+    from taichi_sph.boundary.wounds import Wound
 
 _PERIOD = 0.05
 """Between two updates [s]."""
@@ -200,7 +200,7 @@ class ControlPage:
         self.url = f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
         self._session = session
         self._simulation = session.simulation
-        self._tool = session.simulation.surgery.tool
+        self._tool = session.simulation.tool
         self._spacing = session.simulation.scene.discretization.spacing
         self._full_scale = session.simulation.derived.expected_speed or 1.0
         self._wishes: queue.SimpleQueue[tuple[object, Command]] = queue.SimpleQueue()
@@ -264,7 +264,7 @@ class ControlPage:
             for name, colour in (("/blood", SPEED_COLOURS[0]), ("/drops", SPEED_COLOURS[2]))
         )  # fmt: skip
 
-        shape, self._start = self._tool.shape, self._tool.position
+        shape, self._start = self._tool.surface, self._tool.position
         look = {"color": TOOL_COLOUR[:3]}
         self._body = (
             scene.add_icosphere("/tool", radius=self._spacing, **look)
@@ -369,7 +369,7 @@ class ControlPage:
 
     def _aim(self) -> Command:
         aim = {"command": "tool", "position": self._grip.position.tolist()}
-        return aim if self._tool.shape is None else aim | {"rotation": self._grip.wxyz.tolist()}
+        return aim if self._tool.surface is None else aim | {"rotation": self._grip.wxyz.tolist()}
 
     def _wound(self, radius: float) -> Command:
         return {"command": "wound", "centre": self._marker.position.tolist(), "radius": radius}
@@ -430,7 +430,7 @@ class ControlPage:
                     self._drops.points = picture.drops
         self._body.position = self._tool.position
         self._body.wxyz = np.roll(self._tool.rotation.as_quat(), 1)
-        wounds = {k: w for k, w in enumerate(self._simulation.surgery.wounds) if w.is_open}
+        wounds = {k: w for k, w in enumerate(self._simulation.wounds) if w.is_open}
         if list(map(id, wounds.values())) != list(map(id, self._wounds.values())):
             self._wounds = wounds
             self._show_wounds()

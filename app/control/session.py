@@ -41,7 +41,8 @@ from app.scenes.library import weights_for, with_column
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.runtime import start
 from taichi_sph.scene import Scene, parse_scene
-from taichi_sph.simulation import ModelFactory, Simulation, State
+from taichi_sph.simulation import ModelFactory, Simulation
+from taichi_sph.state import State
 
 if TYPE_CHECKING:
     from app.run.checkpoint import Checkpoint
@@ -111,7 +112,7 @@ class Session:
             InputError: a model cannot be made, or the log cannot be written.
         """
         self.simulation = simulation
-        self.driven = [piston.opening.name for piston in simulation.pistons]
+        self.driven = [driven.opening.name for driven in simulation.inflow.openings]
         self._bounds = [corner.tolist() for corner in simulation.bounds]
         self.models: dict[str, AccelerationModel] = {simulation.model.name: simulation.model}
         for name, maker in makers.items():
@@ -153,7 +154,7 @@ class Session:
     def load_state(self, state: "State", kept: "Kept") -> None:
         """Go on from a state of this session; commands that came after it are done again."""
         simulation = self.simulation
-        simulation.use_model(self.models[state.controls["model"]])
+        simulation.use_model(self.models[state.model])
         simulation.load_state(state)
         for entry in kept.entries:
             by_hand = isinstance(entry.command, Model) and entry.source != "auto"
@@ -246,7 +247,7 @@ class Session:
     def _take_picture(self) -> None:
         simulation = self.simulation
         _, position, velocity = simulation.particles.live()
-        self._picture = Picture(simulation.time, position, velocity, simulation.drops())
+        self._picture = Picture(simulation.time, position, velocity, simulation.outlets.droplets())
         self._pictured, self.watched = clock.perf_counter(), False
 
     def _drain(self, held: bool = False) -> None:
@@ -307,7 +308,7 @@ class Session:
             simulation.gravity = command.vector
         elif isinstance(command, Inflow):
             command = Inflow(factor=min(command.factor, LARGEST_FACTOR), opening=command.opening)
-            simulation.drive(command.factor, command.opening)
+            simulation.inflow.set_factor(command.factor, command.opening)
         elif isinstance(command, Model):
             self.auto = command.name == "auto"
             self._auto_until, self._auto_time, self._stood_in = simulation.time, 0.0, 0.0
@@ -316,14 +317,14 @@ class Session:
             low, high = self._bounds
             x, y, z = map(max, low, map(min, command.position, high))
             command = Tool(position=(x, y, z), rotation=command.rotation)
-            simulation.move_tool(np.array(command.position), _unit(command.rotation))
+            simulation.tool.move_to(np.array(command.position), _unit(command.rotation))
         elif isinstance(command, Suction):
-            simulation.suck(command.rate, command.radius)
+            simulation.suction.set(command.rate, command.radius)
         elif isinstance(command, Wound):
             end = None if command.end is None else np.array(command.end)
-            simulation.wound(np.array(command.centre), command.radius, end)
+            simulation.wounds.open(np.array(command.centre), command.radius, end)
         elif isinstance(command, Clamp):
-            simulation.clamp(command.wound)
+            simulation.wounds.close(command.wound)
         elif isinstance(command, Reset):
             simulation.reset()
             self._past.clear()
@@ -347,7 +348,6 @@ class Session:
         self._past.append((now, figures.time, drained, bled))
         then, since, drained_then, bled_then = self._past[0]
         span = figures.time - since
-        surgery = simulation.surgery
         self._figures = {
             "time": figures.time,
             "frames": frame,
@@ -362,16 +362,16 @@ class Session:
             "guard_share": self._guard_share(figures),
             "model": "auto" if self.auto else simulation.model.name,
             "gravity": list(simulation.gravity),
-            "suction": surgery.suction_rate,
+            "suction": simulation.suction.rate,
             "wounds": [
                 {
                     "centre": w.begin.tolist(), "end": w.end.tolist(), "radius": w.radius,
                     "open": w.is_open,
                 }
-                for w in surgery.wounds
+                for w in simulation.wounds
             ],
-            "tool_position": surgery.tool.position.tolist(),
-            "tool_force": simulation.take_force().tolist(),
+            "tool_position": simulation.tool.position.tolist(),
+            "tool_force": simulation.tool.take_force().tolist(),
         }  # fmt: skip
         if self.auto and figures.compression_p99 > TOO_DENSE:
             self._choose("implicit")
@@ -429,7 +429,7 @@ def _unit(rotation: tuple[float, ...] | None) -> np.ndarray | None:
 def digest(simulation: "Simulation") -> str:
     """Hash of where the blood is and how it moves, bit by bit."""
     text = hashlib.sha256()
-    for rows in simulation.particles.live():
+    for rows in simulation.particles.digested_rows():
         text.update(rows.tobytes())
     return text.hexdigest()[:16]
 
@@ -609,7 +609,7 @@ def open_session(
     commands = [c for _, c in entries] + [e.command for e in kept.entries]
     names = {facts["model"], *(c.name for c in commands if isinstance(c, Model))}
     if begun is not None:
-        names.add(begun.state.controls["model"])
+        names.add(begun.state.model)
     makers, network = _models(MODELS if all_models else names, scene, weights)
     head = {"folder": str(scene.folder), "models": list(makers), **network}
     before = kept.until(begun.frame, begun.state.steps) if begun is not None else []

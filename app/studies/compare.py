@@ -86,7 +86,8 @@ def contestants(
     """
 
     def stand(name: str, of: Scene, make: Callable[..., Any] = SphAcceleration) -> TimedRun:
-        return TimedRun(name, Simulation(of, vessel, make, seed), Trace(scene.frame_interval))
+        simulation = Simulation.from_scene(of, make, seed, vessel)
+        return TimedRun(name, simulation, Trace(scene.frame_interval))
 
     runs = [stand(name, scene, model_factory(name, scene)) for name in ("physics", "implicit")]
     for path in weights:

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from taichi_sph.assemble import OPENING_REACH, SKIN
 from taichi_sph.derived import derive
 from taichi_sph.diagnostics import Diagnostics, diagnose
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.scene import Scene
-from taichi_sph.simulation import OPENING_REACH, SKIN
 
 SOLVERS = {"splishsplash-wcsph": 0, "splishsplash-dfsph": 4}
 """Models by name, with SPlisHSPlasH's number of each."""

@@ -344,12 +344,14 @@ def measure(job: Job) -> list[Row]:
 def _trial(simulation: Simulation, filled: np.ndarray, job: Job, k: int) -> Row:
     """From one start."""
     case, generator = CASES[job.case], np.random.default_rng(k)
-    simulation.place(filled, np.zeros_like(filled))
+    simulation.restart_with(filled, np.zeros_like(filled))
     x, v = (case.begin or column)(simulation, generator)
     if k:
         d = simulation.scene.discretization.spacing
         x = x + JITTER * d * generator.uniform(-1.0, 1.0, x.shape)
-    simulation.place(x, v)
+    simulation.restart_with(x, np.nan_to_num(v))
+    if np.isnan(v).any():  # what a user may not give, and a model must not survive
+        simulation.particles.replace({"identity": np.arange(len(x)), "position": x, "velocity": v})
     interval = case.until / FRAMES
     pour = TimedRun(job.method.name, simulation, Trace(interval), rules=RULES)
     for frame in range(1, FRAMES + 1):

@@ -262,27 +262,27 @@ def record_run(task: Task, report: Callable[[int, int], None]) -> None:
     """
     facts = task.facts
     start(facts.architecture, "f32", task.threads, random_seed=facts.seed)
-    simulation = ReplaySimulation(task.scene, read_vessel(task.scene), facts.seed)
+    replay = ReplaySimulation(task.scene, read_vessel(task.scene), facts.seed)
     scales = FeatureScales(
         facts.support_radius, facts.spacing, facts.frame_interval, facts.sound_speed,
         task.scene.discretization.wall_spacing_ratio,
     )  # fmt: skip
-    wall = simulation.wall
+    wall = replay.simulation.wall
     proxies = Proxies(*(f.to_numpy() for f in (wall.position, wall.normal, wall.volume)))
     with RunWriter(task.part, facts, proxies, _feature_count(facts)) as writer:
         there = writer.committed
         before: RecordedState | None = None
         if there:
             before = writer.state(there - 1)
-            simulation.restore(before, (there - 1) * facts.frame_interval, writer.steps())
+            replay.restore(before, (there - 1) * facts.frame_interval, writer.steps())
         else:
-            simulation.settle()
-        report(there, simulation.steps)
+            replay.settle()
+        report(there, replay.simulation.steps)
         for frame in range(there, facts.frames + 1):
             if frame:
-                simulation.advance_to(frame * facts.frame_interval)
-                simulation.settle()
-            now = simulation.state()
+                replay.advance_to(frame * facts.frame_interval)
+                replay.settle()
+            now = replay.state()
             acceleration = np.zeros_like(now.velocity)
             if before is not None:
                 acceleration = dataset.mean_acceleration(
@@ -290,11 +290,11 @@ def record_run(task: Task, report: Callable[[int, int], None]) -> None:
                 )
             found = None
             if facts.feature_version and frame < facts.frames:
-                simulation.set_acceleration(acceleration)
-                found = simulation.features(scales)[:, :COUNT]
-            writer.append(now, acceleration, found, simulation.substeps())
+                replay.set_acceleration(acceleration)
+                found = replay.features(scales)[:, :COUNT]
+            writer.append(now, acceleration, found, replay.substeps())
             before = now
-            report(frame + 1, simulation.steps)
+            report(frame + 1, replay.simulation.steps)
 
 
 def work(task: Task, parent: Connection) -> None:

@@ -11,7 +11,7 @@ import trimesh
 
 from app.scenes.library import find_scene
 from app.validation.report import Report
-from taichi_sph.boundary.tool import FOLLOWING
+from taichi_sph.boundary.tool import RESPONSE_TIME
 from taichi_sph.geometry.mesh import enclosed_volume
 from taichi_sph.scene import Column, NewtonianTable, Scene, ToolTable, WallTable
 from taichi_sph.simulation import Simulation
@@ -57,19 +57,19 @@ def account(report: Report, quick: bool) -> None:
     _watch(simulation, until, report, 0.0, 1.0)
     # What is marked as gone is dropped at the next build.
     live = int((simulation.identities() >= 0).sum())
-    left = int(simulation.exits.account().sum())
-    wrong = live - (begun + simulation.added - left)
+    left = int(simulation.outlets.outflow_counts().sum())
+    wrong = live - (begun + simulation.inflow.added - left)
     report.add(
         f"pump and reservoir, {until:g} s: blood there (error: particles)", f"{live}",
-        f"{begun} + {simulation.added} - {left}", abs(wrong), 0.0,
+        f"{begun} + {simulation.inflow.added} - {left}", abs(wrong), 0.0,
     )  # fmt: skip
     volume = simulation.scene.discretization.spacing**3
-    pump = simulation.pistons[0]
+    pump = simulation.inflow.openings[0]
     report.add(
-        "pump: volume added (error: particles)", f"{1e6 * simulation.added * volume:.4f} ml",
-        f"{1e6 * pump.pushed:.4f} ml", abs(simulation.added - pump.pushed / volume),
+        "pump: volume added (error: particles)", f"{1e6 * simulation.inflow.added * volume:.4f} ml",
+        f"{1e6 * pump.volume_in:.4f} ml", abs(simulation.inflow.added - pump.volume_in / volume),
         # Blood is added when lists are built, which is when it has moved half a skin, a tenth of a
-        # spacing; the columns' leads are even to within two.
+        # spacing; the strands' phases are even to within two.
         0.1 * len(pump.sites) + 2.0,
     )  # fmt: skip
 
@@ -81,7 +81,7 @@ def wound(report: Report, quick: bool) -> None:
     scene = _tube(spacing, {"pressure": pressure}, {"pressure": pressure})
     simulation = Simulation.from_scene(scene)
     _watch(simulation, 0.06, report, 0.0, 0.6)
-    hole = simulation.wound(np.array([5e-3, 0.0, 0.0]), radius)
+    hole = simulation.wounds.open(np.array([5e-3, 0.0, 0.0]), radius)
     _watch(simulation, 0.066, report, 0.6, 0.7)
     before = simulation.diagnostics().bled_volume
     _watch(simulation, 0.086, report, 0.7, 1.0)
@@ -145,27 +145,27 @@ def tool(report: Report, quick: bool) -> None:
     simulation = _tank_with_sphere(radius, 0.05)
     blood, gravity = simulation.scene.blood, -simulation.scene.gravity[2]
     _watch(simulation, 0.12, report, 0.0, 0.5)
-    simulation.take_force()
+    simulation.tool.take_force()
     _watch(simulation, 0.16, report, 0.5, 0.6)
-    shape = simulation.surgery.tool.shape
-    assert shape is not None
-    weight = enclosed_volume(shape.vertices, shape.faces) * blood.density * gravity
-    lift = float(simulation.take_force()[2])
+    surface = simulation.tool.surface
+    assert surface is not None
+    weight = enclosed_volume(surface.vertices, surface.faces) * blood.density * gravity
+    lift = float(simulation.tool.take_force()[2])
     report.compare("sphere of 8 spacings in a tank: lift", 1e3 * lift, 1e3 * weight, 0.05, "mN")
 
     simulation = _tank_with_sphere(radius, thick)
     _watch(simulation, 0.08, report, 0.6, 0.8)
-    lift = float(simulation.take_force()[2])
+    lift = float(simulation.tool.take_force()[2])
 
     def go_down() -> None:
-        place = simulation.surgery.tool.position
-        simulation.move_tool(place - np.array([0.0, 0.0, speed * FOLLOWING]))
+        place = simulation.tool.position
+        simulation.tool.move_to(place - np.array([0.0, 0.0, speed * RESPONSE_TIME]))
 
     simulation.advance_to(0.12, go_down)
-    simulation.take_force()
+    simulation.tool.take_force()
     simulation.advance_to(0.16, go_down)
     report.advance(1.0)
-    drag = float(simulation.take_force()[2]) - lift
+    drag = float(simulation.tool.take_force()[2]) - lift
     theory = IN_A_TUBE * 6.0 * math.pi * thick * radius * speed
     report.add(
         "the sphere moved through thick blood: drag (error: the factor, less 1)",

@@ -1,6 +1,7 @@
 """Flows without a vessel, for `vesselflow validate` and the tests: tubes, boxes, slabs, tanks.
 
-Each is a `Motion` that users' scenes run too; only the wall and the blood are laid out by hand.
+Each is a `Simulation`, as users' scenes are, without boundaries: only the wall and the blood are
+laid out by hand.
 Periodic axes are eight spacings long or more, the least that the neighbour lists allow.
 """
 
@@ -10,15 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from taichi_sph.boundary.boundary import BloodFlow
 from taichi_sph.fluid.calibration import calibrate
 from taichi_sph.fluid.equation_of_state import Tait
 from taichi_sph.fluid.rheology import Casson, Newtonian
 from taichi_sph.fluid.wcsph import Fluid, SphAcceleration
-from taichi_sph.motion import Motion
-from taichi_sph.particles.neighbors import Neighbors, make_grid
+from taichi_sph.particles.grid import make_grid
+from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
+from taichi_sph.simulation import Simulation
 
 DENSITY = 1060.0
 """rho_0 of blood, as scenes have it [kg/m^3]."""
@@ -40,7 +43,7 @@ SLAB = 8
 """Spacings along a periodic axis on which nothing depends."""
 
 FAR = 1e6
-"""A time that no step reaches [s]: `Motion.step(FAR)` takes the longest stable step."""
+"""A time that no step reaches [s]: `Simulation.step(FAR)` takes the longest stable step."""
 
 SKIN = 0.2
 """Skin of the lists over the support radius."""
@@ -97,9 +100,9 @@ class State:
     """[kg/m^3], shape (n,)."""
 
 
-def state_of(motion: Motion) -> State:
+def state_of(simulation: Simulation) -> State:
     """The state that the fields hold."""
-    p = motion.particles
+    p = simulation.particles
     return State(*(p.in_order(f).astype(float) for f in (p.position, p.velocity, p.density)))
 
 
@@ -110,7 +113,7 @@ def pressure_of(density: np.ndarray, equation_of_state: Tait) -> np.ndarray:
     return np.maximum(0.0, p + equation_of_state.background_pressure)
 
 
-def make_motion(
+def make_simulation(
     liquid: Liquid,
     position: np.ndarray,
     velocity: np.ndarray | None,
@@ -119,7 +122,7 @@ def make_motion(
     box: tuple[np.ndarray, np.ndarray],
     period: np.ndarray,
     body_force: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> Motion:
+) -> Simulation:
     """Blood and wall in a box (lower, upper) [m]; body force per mass [m/s^2]."""
     fluid = liquid.fluid()
     kernel, skin = fluid.kernel, SKIN * fluid.kernel.support_radius
@@ -132,19 +135,18 @@ def make_motion(
         liquid.wall_spacing,
         period if period.any() else None,
     )
-    return Motion(
-        Particles.from_numpy(position, velocity, fluid.calibration.mass),
+    neighbors = Neighbors.allocate(
+        make_grid(*box, reach, period),
+        kernel.support_radius,
+        skin,
+        len(position),
+        liquid.spacing,
         wall,
-        Neighbors.allocate(
-            make_grid(*box, reach, period),
-            kernel.support_radius,
-            skin,
-            len(position),
-            liquid.spacing,
-            wall,
-        ),
+    )
+    particles = Particles.from_numpy(position, velocity, fluid.calibration.mass)
+    return Simulation(
+        BloodFlow(particles, wall, neighbors, body_force),
         SphAcceleration(fluid, len(position)),
-        body_force,
         speed_limit=liquid.sound_speed,
     )
 
@@ -164,7 +166,7 @@ def box(
     velocity: Callable[[np.ndarray], np.ndarray],
     jitter: float = 0.0,
     seed: int = 0,
-) -> Motion:
+) -> Simulation:
     """A periodic box of blood with a velocity that depends on position.
 
     Args:
@@ -179,11 +181,11 @@ def box(
     if jitter:
         noise = np.random.default_rng(seed).normal(size=x.shape)
         x = (x + jitter * liquid.spacing * noise) % size
-    motion = make_motion(liquid, x, velocity(x), NO_WALL, NO_WALL, (0.0 * size, size), size)
+    simulation = make_simulation(liquid, x, velocity(x), NO_WALL, NO_WALL, (0.0 * size, size), size)
     if jitter:
-        settle(motion)
-        set_velocity(motion, velocity)
-    return motion
+        settle(simulation)
+        set_velocity(simulation, velocity)
+    return simulation
 
 
 def rings(radius: float, spacing: float, length: float) -> np.ndarray:
@@ -239,7 +241,7 @@ def tube_wall(
 
 def tube(
     liquid: Liquid, radius: float, drive: float, ordered: bool = True, layers: int = SLAB
-) -> Motion:
+) -> Simulation:
     """A periodic tube full of blood at rest, about to be driven along z by rho g = `drive` [Pa/m].
 
     One particle for every d^3 of the tube, which gives the density sum rho_0 on a lattice.  The
@@ -252,14 +254,14 @@ def tube(
     setback = liquid.fluid().calibration.setback
     wall, normal = tube_wall(radius + setback, liquid.wall_spacing, 0.0, length, True)
     edge = radius + setback + liquid.kernel.support_radius
-    motion = make_motion(
+    simulation = make_simulation(
         liquid, x, None, wall, normal,
         (np.array([-edge, -edge, 0.0]), np.array([edge, edge, length])),
         np.array([0.0, 0.0, length]),
         (0.0, 0.0, drive / DENSITY),
     )  # fmt: skip
-    settle(motion)
-    return motion
+    settle(simulation)
+    return simulation
 
 
 def plane_proxies(width: float, depth: float, spacing: float) -> np.ndarray:
@@ -277,14 +279,14 @@ def matched(liquid: Liquid) -> Liquid:
     return replace(liquid, wall_spacing_ratio=8.0 / 9.0)
 
 
-def column(liquid: Liquid, layers: int, gravity: float) -> Motion:
+def column(liquid: Liquid, layers: int, gravity: float) -> Simulation:
     """A column on a floor at z = 0, periodic to the sides, `layers` spacings high, at rest."""
     liquid = matched(liquid)
     d, side = liquid.spacing, SLAB * liquid.spacing
     floor = plane_proxies(side, side, d)
     floor[:, 2] = -liquid.fluid().calibration.setback
     reach = 2.0 * liquid.kernel.support_radius
-    return make_motion(
+    return make_simulation(
         liquid, lattice((SLAB, SLAB, layers), d), None,
         floor, np.tile([0.0, 0.0, -1.0], (len(floor), 1)),
         (np.array([0.0, 0.0, -reach]), np.array([side, side, layers * d + reach])),
@@ -292,7 +294,7 @@ def column(liquid: Liquid, layers: int, gravity: float) -> Motion:
     )  # fmt: skip
 
 
-def channel(liquid: Liquid, across: int, drive: float) -> Motion:
+def channel(liquid: Liquid, across: int, drive: float) -> Simulation:
     """Blood between plates at z = 0 and z = across d, driven along x by `drive` [Pa/m]."""
     liquid = matched(liquid)
     d, side = liquid.spacing, SLAB * liquid.spacing
@@ -301,14 +303,14 @@ def channel(liquid: Liquid, across: int, drive: float) -> Motion:
     wall = np.concatenate([plate - [0.0, 0.0, setback], plate + [0.0, 0.0, across * d + setback]])
     normal = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], len(plate), axis=0)
     reach = 2.0 * liquid.kernel.support_radius
-    return make_motion(
+    return make_simulation(
         liquid, lattice((SLAB, SLAB, across), d), None, wall, normal,
         (np.array([0.0, 0.0, -reach]), np.array([side, side, across * d + reach])),
         np.array([side, side, 0.0]), (drive / DENSITY, 0.0, 0.0),
     )  # fmt: skip
 
 
-def dam(liquid: Liquid, across: int, run: float, gravity: float) -> Motion:
+def dam(liquid: Liquid, across: int, run: float, gravity: float) -> Simulation:
     """A column `across` spacings wide and twice as high against a wall at x = 0, free to fall.
 
     The floor reaches `run` column widths; the flow is plane, periodic along y.
@@ -328,32 +330,32 @@ def dam(liquid: Liquid, across: int, run: float, gravity: float) -> Motion:
         [np.tile([0.0, 0.0, -1.0], (len(floor), 1)), np.tile([-1.0, 0.0, 0.0], (len(back), 1))]
     )
     reach = 2.0 * liquid.kernel.support_radius
-    return make_motion(
+    return make_simulation(
         liquid, lattice((across, SLAB, 2 * across), d), None, np.concatenate([floor, back]), normal,
         (np.array([-reach, 0.0, -reach]), np.array([run * width, side, 2.5 * width])),
         np.array([0.0, side, 0.0]), (0.0, 0.0, -gravity),
     )  # fmt: skip
 
 
-def settle(motion: Motion, steps: int = 500) -> None:
+def settle(simulation: Simulation, steps: int = 500) -> None:
     """Let particles find their places without a body force, then put the clock back to zero.
 
     Velocities are set to zero at every step at first (overlaps push hard), then at every fifth.
     """
-    force, limit = motion.gravity, motion.speed_limit
-    motion.gravity, motion.speed_limit = (0.0, 0.0, 0.0), math.inf
+    force, limit = simulation.gravity, simulation.speed_limit
+    simulation.gravity, simulation.speed_limit = (0.0, 0.0, 0.0), math.inf
     for k in range(steps):
-        motion.step(FAR)
+        simulation.step(FAR)
         if k < steps // 5 or k % 5 == 4:
-            motion.particles.velocity.fill(0.0)
-    motion.particles.velocity.fill(0.0)
-    motion.gravity, motion.speed_limit = force, limit
-    motion.time, motion.steps, motion.wall_corrections = 0.0, 0, 0
+            simulation.particles.velocity.fill(0.0)
+    simulation.particles.velocity.fill(0.0)
+    simulation.gravity, simulation.speed_limit = force, limit
+    simulation.time, simulation.steps, simulation.wall_corrections = 0.0, 0, 0
 
 
-def set_velocity(motion: Motion, velocity: Callable[[np.ndarray], np.ndarray]) -> None:
+def set_velocity(simulation: Simulation, velocity: Callable[[np.ndarray], np.ndarray]) -> None:
     """Give every particle the velocity of its place."""
-    p = motion.particles
+    p = simulation.particles
     rows = np.zeros(p.velocity.shape + (3,))
     live = p.count[None]
     rows[:live] = velocity(p.position.to_numpy()[:live].astype(float))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_sph.motion import Motion
+from taichi_sph.simulation import Simulation
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def relative_l2(computed: np.ndarray, theory: np.ndarray) -> float:
 
 
 def watched(
-    motion: Motion,
+    motion: Simulation,
     times: list[float],
     report: Report,
     begin: float,

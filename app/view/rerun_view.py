@@ -441,14 +441,15 @@ class RerunView:
         faces = faces.reshape(-1, 3)
         vertices = np.asarray(vessel.vertices, float)[used]
         normals = vertex_normals(vertices, faces)
-        if simulation.pulse is not None:
-            reach = simulation.pulse.reach(vessel, vertices)
-            self._wall = vertices, reach[:, None] * normals
+        wall_motion = simulation.wall_motion
+        if wall_motion is not None:
+            amplitude = wall_motion.motion.amplitude_at(vessel, vertices)
+            self._wall = vertices, amplitude[:, None] * normals
         stream.log(
             "world/vessel",
             rr.Mesh3D.from_fields(
                 # What is static hides what is logged with a time.
-                vertex_positions=vertices if simulation.pulse is None else None,
+                vertex_positions=vertices if wall_motion is None else None,
                 triangle_indices=faces,
                 vertex_normals=normals,
                 albedo_factor=list(WALL_COLOUR),
@@ -480,7 +481,7 @@ class RerunView:
                 rr.LineStrips3D.from_fields(radii=0.3 * self._radius, colors=[WOUND_COLOUR]),
             ),
         ]
-        shape = simulation.surgery.tool.shape
+        shape = simulation.tool.surface
         if shape is None:
             looks.append(("tool", rr.Points3D.from_fields(colors=[TOOL_COLOUR])))
         else:
@@ -517,7 +518,7 @@ class RerunView:
             items += self._surgery(simulation)
             if self._wall is not None:
                 narrow, way = self._wall
-                wall = narrow + simulation.wall.level * way
+                wall = narrow + simulation.wall.displacement_factor * way
                 items.append(("world/vessel", rr.Mesh3D.from_fields(vertex_positions=wall)))
         in_vessel = figures.particles / max(1, simulation.derived.blood_particles) * self._volume
         values = {
@@ -554,26 +555,25 @@ class RerunView:
 
     def _surgery(self, simulation: "Simulation") -> Items:
         """Drops outside, open wounds and the tool."""
-        surgery = simulation.surgery
         items: Items = []
         # After a reset there are none any more, which must be said too.
-        self._wounded |= bool(surgery.wounds)
+        self._wounded |= len(simulation.wounds) > 0
         if self._wounded:
-            items.append(("world/drops", rr.Points3D(simulation.drops())))
-            rims = rr.LineStrips3D([w.rim() for w in surgery.wounds if w.is_open])
+            items.append(("world/drops", rr.Points3D(simulation.outlets.droplets())))
+            rims = rr.LineStrips3D([w.rim() for w in simulation.wounds if w.is_open])
             items.append(("world/wounds", rims))
-        tool = surgery.tool
-        if tool.shape is not None:
+        tool, suction = simulation.tool, simulation.suction
+        if tool.surface is not None:
             pose = rr.Transform3D(
                 translation=tool.position, quaternion=rr.Quaternion(xyzw=tool.rotation.as_quat())
             )
             items.append(("world/tool", pose))
         else:
-            sucks = surgery.suction_rate > 0.0
+            sucks = suction.rate > 0.0
             self._sucked |= sucks
             if self._sucked:
                 places = [tool.position] if sucks else []
-                tip = rr.Points3D(places, radii=surgery.suction_radius)
+                tip = rr.Points3D(places, radii=suction.radius)
                 items.append(("world/tool", tip))
         return items
 

@@ -1,4 +1,4 @@
-"""Stage: a simulation that can be put into a recorded state and driven by either model."""
+"""Replay: a simulation that can be put into a recorded state and driven by either model."""
 
 import numpy as np
 import taichi as ti
@@ -12,22 +12,18 @@ from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 
 
-class ReplaySimulation(Simulation):
+class ReplaySimulation:
     """A simulation whose future is a function of what a frame stores, and of nothing else.
 
     Lists that are built once in some steps sum in an order that depends on where blood was then.
     `settle` builds them at every frame, so that a run restored from a frame goes on bit for bit.
     """
 
-    fluid: Fluid
-    """The constants of the physics."""
-    physics: SphAcceleration
-
     def __init__(self, scene: Scene, vessel: Vessel, seed: int):
-        """As `Simulation`, by the physics and with no step longer than the scene's own.
+        """Set up the scene, by the physics and with no step longer than the scene's own.
 
         Raises:
-            InputError: as `Simulation`, or a pump or the wall drives it, and not the blood alone.
+            InputError: as `Simulation.from_scene`, or a pump or the wall drives the blood.
         """
         for name, table in scene.openings.items():
             if table.driven:
@@ -37,35 +33,43 @@ class ReplaySimulation(Simulation):
                 )
         if scene.wall is not None:
             raise InputError("wall: pulses; only scenes whose wall stands still can be recorded")
-        super().__init__(scene, vessel, self._make_model, seed)
-        self.step_limit = self.derived.step
-        self._taken: list[float] = []
-        self._features = ti.ndarray(float, (self.particles.capacity, GATHERED))
+        self.simulation = Simulation.from_scene(scene, SphAcceleration, seed, vessel)
+        assert isinstance(self.simulation.model, SphAcceleration)
+        self.physics: SphAcceleration = self.simulation.model
+        self.fluid: Fluid = self.simulation.fluid
+        """Constants of the physics."""
+        self.use_physics()
+        self._step_lengths: list[float] = []
+        self._features = ti.ndarray(float, (self.simulation.particles.capacity, GATHERED))
 
-    def _make_model(self, fluid: Fluid, capacity: int) -> SphAcceleration:
-        self.fluid = fluid
-        self.physics = SphAcceleration(fluid, capacity)
-        return self.physics
+    def use_physics(self) -> None:
+        """Let the physics drive, with no step longer than the scene's own."""
+        self.simulation.use_model(self.physics)
+        self.simulation.step_limit = self.simulation.derived.step
 
-    def step(self, remaining: float) -> None:
-        """As `Simulation`; the step is noted."""
-        super().step(remaining)
-        self._taken.append(self.last_step)
+    def advance_to(self, time: float) -> None:
+        """Step until a simulated time [s], noting each step.
+
+        Raises:
+            RunError: the run diverged.
+        """
+        self.simulation.advance_to(time, after_step=self._note_step)
+
+    def _note_step(self) -> None:
+        self._step_lengths.append(self.simulation.last_step)
 
     def substeps(self) -> Substeps:
         """Steps taken since this was last asked."""
-        taken, self._taken = self._taken, []
-        return Substeps(len(taken), min(taken), max(taken)) if taken else Substeps()
+        steps, self._step_lengths = self._step_lengths, []
+        return Substeps(len(steps), min(steps), max(steps)) if steps else Substeps()
 
     def settle(self) -> None:
         """Drop what has left, and build the lists for blood as it stands."""
-        self.before_build()
-        self.neighbors.build(self.particles, self.wall)
-        self._stale = False
+        self.simulation.rebuild_lists()
 
     def state(self) -> RecordedState:
         """The blood, a row for each particle of the start."""
-        particles = self.particles
+        particles = self.simulation.particles
         identity = particles.identity.to_numpy()[: particles.count[None]]
         alive = np.zeros(particles.capacity, bool)
         alive[identity] = True
@@ -80,14 +84,13 @@ class ReplaySimulation(Simulation):
     def restore(self, state: RecordedState, time: float, steps: int) -> None:
         """Go back, or on, to a state at a time [s] after a number of steps."""
         rows = np.flatnonzero(state.alive)
-        self.put(rows, state.position[rows], state.velocity[rows])
-        self.time = time
-        self.steps = steps
+        self.simulation.set_blood(rows, state.position[rows], state.velocity[rows])
+        self.simulation.time, self.simulation.steps = time, steps
         self.settle()
 
     def set_acceleration(self, acceleration: np.ndarray) -> None:
         """Give every particle a previous acceleration [m/s^2], by identity, (n, 3)."""
-        particles = self.particles
+        particles = self.simulation.particles
         identity = particles.identity.to_numpy()[: particles.count[None]]
         rows = particles.acceleration.to_numpy()
         rows[: len(identity)] = acceleration[identity]
@@ -95,14 +98,16 @@ class ReplaySimulation(Simulation):
 
     def viscosity(self) -> np.ndarray:
         """The physics' viscosity of the blood as it stands [Pa s], a row a particle."""
-        own = self.physics
+        blood, own = self.simulation.blood, self.physics
         sum_density(
-            self.particles, self.wall, self.neighbors, own.fluid, own.pressure_term, own.viscosity
-        )
-        return own.viscosity.to_numpy()[: self.particles.count[None]]
+            blood.particles, blood.wall, blood.neighbors, own.fluid, own.pressure_term,
+            own.viscosity,
+        )  # fmt: skip
+        return own.viscosity.to_numpy()[: blood.particles.count[None]]
 
     def features(self, scales: FeatureScales) -> np.ndarray:
         """What `nn.features.features_of` gives for the state as it stands, a row a particle."""
+        blood = self.simulation.blood
         self._features.fill(0.0)
-        extract(self.particles, self.wall, self.neighbors, self.fluid, scales, self._features)
+        extract(blood.particles, blood.wall, blood.neighbors, self.fluid, scales, self._features)
         return self._features.to_numpy()

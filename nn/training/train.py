@@ -100,7 +100,7 @@ class TrainingSample:
     ):
         """Read the stage's lists; `target` [m/s^2] and `valid` go by identity."""
         fluid = stage.fluid
-        particles, nb = stage.particles, stage.neighbors
+        particles, nb = stage.simulation.particles, stage.simulation.neighbors
         n = particles.count[None]
         identity = particles.identity.to_numpy()[:n]
         self.identity = identity
@@ -135,11 +135,11 @@ class TrainingSample:
         damping = 2.0 * fluid.signal * slope * approach / (density[i] + density[j])
         known = _sums(i, damping[:, None] * r, n)
         i, k = _entries(nb.wall_count.to_numpy()[:n], nb.wall_index.to_numpy()[:n])
-        r = x[i] - stage.wall.position.to_numpy()[k]
+        r = x[i] - stage.simulation.wall.position.to_numpy()[k]
         r2 = (r**2).sum(axis=1)
         share = (
             fluid.equation_of_state.rest_density
-            * stage.wall.volume.to_numpy()[k]
+            * stage.simulation.wall.volume.to_numpy()[k]
             * kernel.slope_of(np.sqrt(r2))
         )
         self.wall_push = _f32(
@@ -274,7 +274,7 @@ class TrainingRuns:
         largest = max((*self.runs, *self.held), key=lambda run: run.facts.particles)
         self.scene = largest.scene
         self.stage = ReplaySimulation(self.scene, read_vessel(self.scene), largest.facts.seed)
-        low, high = self.stage.vessel.bounds
+        low, high = self.stage.simulation.vessel.bounds
         self.extent = float(np.linalg.norm(np.asarray(high) - np.asarray(low)))
         """Diagonal of the vessel's box [m]."""
         self.interval = facts.frame_interval
@@ -315,7 +315,7 @@ class TrainingRuns:
         key = training.head, training.inputs, training.rounds, weights.sizes, arrays
         if key not in self._nets:
             stage = self.stage
-            capacity = stage.particles.capacity
+            capacity = stage.simulation.particles.capacity
             self._nets[key] = make_pcnet(weights, stage.fluid, self.scales, capacity, guarded=False)
         self._nets[key].network.load(weights)
         return self._nets[key]
@@ -331,16 +331,16 @@ class TrainingRuns:
         Raises:
             RunError: it diverged.
         """
-        self.stage.model, self.stage.step_limit = model, math.inf
-        self.stage.advance_to(self.stage.time + frames * self.interval)
+        self.stage.simulation.model, self.stage.simulation.step_limit = model, math.inf
+        self.stage.advance_to(self.stage.simulation.time + frames * self.interval)
         self.stage.settle()
 
     def relabel(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean acceleration [m/s^2] of the physics over the next frame, and where it is valid."""
         stage = self.stage
         before = stage.state()
-        stage.model, stage.step_limit = stage.physics, stage.derived.step
-        stage.advance_to(stage.time + self.interval)
+        stage.use_physics()
+        stage.advance_to(stage.simulation.time + self.interval)
         stage.settle()
         after = stage.state()
         target = mean_acceleration(before.velocity, after.velocity, after.alive, self.interval)
@@ -368,7 +368,7 @@ class TrainingRuns:
         """
         stage, frames = self.stage, len(run)
         self.put(run, 0)
-        stage.model, stage.step_limit = model, math.inf
+        stage.simulation.model, stage.simulation.step_limit = model, math.inf
         distance = length = drained = worst = 0.0
         last = None
         survived = 0
@@ -378,19 +378,19 @@ class TrainingRuns:
                 stage.advance_to(frame * self.interval)  # in several steps, where blood is fast
             except RunError:
                 break
-            n = stage.particles.count[None]
+            n = stage.simulation.particles.count[None]
             if not alive.any() or (not n and alive.mean() < FEW):
                 survived = frames
                 break
             if not n:
                 break
-            density = stage.particles.density.to_numpy()[:n]
+            density = stage.simulation.particles.density.to_numpy()[:n]
             p99, _ = compression(density, stage.fluid.equation_of_state.rest_density)
             worst = max(worst, p99)
             if not p99 < DIED:
                 break
             centre = run.position(frame)[alive].mean(axis=0)
-            here = stage.particles.position.to_numpy()[:n].mean(axis=0)
+            here = stage.simulation.particles.position.to_numpy()[:n].mean(axis=0)
             if alive.mean() > FEW:
                 length += float(np.linalg.norm(centre - last)) if last is not None else 0.0
                 distance = max(distance, float(np.linalg.norm(here - centre)))

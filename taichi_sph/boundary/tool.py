@@ -1,125 +1,64 @@
-"""A rigid tool: a closed surface sampled as proxies, moved from outside, felt by the blood."""
+"""A rigid tool: it is moved from outside, pushes blood, and feels the blood's force."""
 
 import math
-from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
-import igl
 import numpy as np
-import taichi as ti
 from scipy.spatial.transform import Rotation
 
-from taichi_sph.errors import InputError
-from taichi_sph.geometry import wall_sampling
-from taichi_sph.geometry.mesh import Booleans, Floats, Integers, NearestPoint, clean, is_closed
-from taichi_sph.geometry.surface_file import load_surface, require_manifold, require_outward
-from taichi_sph.particles.neighbors import Neighbors
-from taichi_sph.particles.smoothing_kernel import WendlandC2
-from taichi_sph.particles.wall import Wall, proxy_volumes
+from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.tool_surface import ToolSurface
+from taichi_sph.fluid.wcsph import AccelerationModel, force_on_tool
+from taichi_sph.geometry.mesh import Floats
+from taichi_sph.particles.wall import place_tool
 from taichi_sph.runtime import float_dtype
-from taichi_sph.scene import ToolTable
 
-FOLLOWING = 0.01
-"""A tool nears where it is wanted by 1/e in this time [s]: a hand's jumps, which come 30 times a
-second, become a motion."""
+RESPONSE_TIME = 0.01
+"""A tool nears its target by 1/e in this time [s]: a hand's jumps, which come 30 times a second,
+become a motion."""
 
 LARGEST_SPEED = 0.5
 """No part of a tool moves faster [m/s]; a surgeon's hand reaches some 0.2 m/s."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """Proxies of a tool about its own origin."""
+class Tool(Boundary):
+    """Where the tool is, and its target; without a surface, a mere tip for the suction."""
 
-    position: Floats
-    """Set back inside the tool [m], (n, 3)."""
-    normal: Floats
-    """Unit normals into the tool, that is out of the blood, (n, 3)."""
-    volume: Floats
-    """V_k of Eq. 3 [m^3], (n,)."""
-    vertices: Floats
-    """Of the surface [m], (v, 3)."""
-    faces: Integers
-    """(f, 3)."""
-    radius: float
-    """Of a ball about the origin that holds the proxies [m]."""
+    name = "tool"
 
-    def clear_of(self, points: Floats) -> Booleans:
-        """Which points (n, 3) [m], about the tool's origin, lie outside it."""
-        tree = igl.FastWindingNumberBVH()
-        tree.init(np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces, np.int64))
-        turns = tree.winding_number(np.ascontiguousarray(points, np.float64))
-        return np.asarray(turns).reshape(-1) < 0.5
-
-    def distance(self, points: Floats) -> Floats:
-        """Distance of points (n, 3) [m], about the tool's origin, to its surface [m], (n,)."""
-        return NearestPoint(self.vertices, self.faces)(points)[0]
-
-
-def read_shape(
-    table: ToolTable, folder: Path, spacing: float, setback: float, kernel: WendlandC2
-) -> Shape:
-    """Sample the surface of a scene's tool.
-
-    Args:
-        table: the scene's.
-        folder: where its surface file is.
-        spacing: of the proxies [m].
-        setback: how far inside the surface they stand [m].
-        kernel: of the blood.
-
-    Raises:
-        InputError: the surface cannot be used.
-    """
-    path = folder / table.surface
-    vertices, faces = load_surface(path)
-    vertices, faces = clean(vertices * table.scale, faces)
-    require_manifold(vertices, faces, str(path))
-    if not is_closed(faces):
-        raise InputError(f"{path}: the tool's surface has holes; it must be closed")
-    require_outward(vertices, faces, str(path))
-    points, nearest = wall_sampling.relaxed_points(vertices, faces, spacing, seed=0)
-    outward = wall_sampling.normals_at(vertices, faces, points, nearest)
-    position = points - setback * outward
-    shape = Shape(
-        position, -outward, proxy_volumes(position, kernel), vertices, faces,
-        float(np.linalg.norm(position, axis=1).max()),
-    )  # fmt: skip
-    outside = int(shape.clear_of(position).sum())
-    if outside:
-        raise InputError(
-            f"{path}: the tool is thinner than {2.0 * setback:.3g} m in places ({outside} of "
-            f"{len(position)} proxies do not fit in it); make it thicker or the spacing smaller"
-        )
-    return shape
-
-
-class Tool:
-    """Where the tool is, and where it is wanted; without a shape, a mere point for the suction."""
-
-    def __init__(self, shape: Shape | None, position: Floats):
+    def __init__(self, blood: BloodFlow, surface: ToolSurface | None, position: Floats):
         """Put it at a position [m]."""
-        self.shape = shape
+        self.blood = blood
+        self.surface = surface
         self.home = np.asarray(position, float)
         """Where it is at the start [m]."""
-        self.start_again()
-
-    def start_again(self) -> None:
-        """As at the start."""
-        self.position = self.home
-        self.rotation = Rotation.identity()
-        self.wanted_position = self.position
-        self.wanted_rotation = self.rotation
+        self.position = self.target_position = self.home
+        self.rotation = self.target_rotation = Rotation.identity()
         self.velocity = np.zeros(3)
         """[m/s]"""
         self.spin = np.zeros(3)
         """[rad/s]"""
+        self.last_displacement = 0.0
+        """How far a part of it may have gone in the last step [m]."""
         self._reached: tuple[object, object] = (None, None)
+        """Target at which it came to rest: the position and the rotation themselves."""
+        self._impulse = np.zeros(3)
+        """Impulse of the blood on the tool since the force was last taken [N s]."""
+        self._impulse_time = 0.0
+        """Time over which it was summed [s]."""
+        self.write_proxies()
 
-    @property
-    def count(self) -> int:
-        """Number of proxies."""
-        return 0 if self.shape is None else len(self.shape.position)
+    def move_to(self, position: Floats, rotation: Floats | None = None) -> None:
+        """Set the target: a position [m] and, unless it stays, a quaternion w, x, y, z."""
+        self.target_position = np.asarray(position, float)
+        if rotation is not None:
+            self.target_rotation = Rotation.from_quat(np.roll(rotation, -1))
+
+    def take_force(self) -> Floats:
+        """Force of the blood on the tool, mean since this was last asked [N], (3,)."""
+        force = self._impulse / self._impulse_time if self._impulse_time else np.zeros(3)
+        self._impulse, self._impulse_time = np.zeros(3), 0.0
+        return force
 
     @property
     def at_rest(self) -> bool:
@@ -127,86 +66,120 @@ class Tool:
         return not (self.velocity.any() or self.spin.any())
 
     @property
-    def settled(self) -> bool:
-        """Whether it has come to rest where it is still wanted: most steps of most runs."""
-        wanted = self.wanted_position, self.wanted_rotation
-        return self._reached[0] is wanted[0] and self._reached[1] is wanted[1]
+    def arrived(self) -> bool:
+        """Whether it has come to rest at its target: most steps of most runs."""
+        target = self.target_position, self.target_rotation
+        return self._reached[0] is target[0] and self._reached[1] is target[1]
 
-    def aim(self) -> None:
-        """Choose the velocity for the next step; of a tool with a shape, as `move`."""
-        assert self.shape is not None
-        away = self.wanted_position - self.position
+    def before_drift(self, dt: float, model: AccelerationModel) -> float:
+        """Add the force of this step to the impulse, then move by it; how far a proxy may go [m].
+
+        A mere tip pushes no blood and jumps: no proxy moves.
+        """
+        blood = self.blood
+        if blood.wall.tool and model.pair_coefficients is not None:
+            force = force_on_tool(
+                blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients
+            )
+            self._impulse += dt * np.array([force[0], force[1], force[2]])
+            self._impulse_time += dt
+        self.last_displacement = 0.0
+        if self.arrived:
+            return 0.0
+        if self.surface is None:
+            self.last_displacement = self.teleport()
+            return 0.0
+        moved = not self.at_rest
+        self.update_velocity()
+        if self.at_rest and not moved:
+            return 0.0
+        self.last_displacement = self.move(dt)
+        self.write_proxies()
+        return self.last_displacement
+
+    def update_velocity(self) -> None:
+        """Choose the velocity for the next step; of a tool with a surface, as `move`."""
+        assert self.surface is not None
+        away = self.target_position - self.position
         self.velocity = self._bounded(away, 1.0)
         self.spin = np.zeros(3)
-        if self.wanted_rotation is not self.rotation:
-            turn = (self.wanted_rotation * self.rotation.inv()).as_rotvec()
-            self.spin = self._bounded(turn, self.shape.radius)
+        if self.target_rotation is not self.rotation:
+            turn = (self.target_rotation * self.rotation.inv()).as_rotvec()
+            self.spin = self._bounded(turn, self.surface.radius)
         if self.at_rest:
-            self._reached = self.wanted_position, self.wanted_rotation
-
-    def jump(self) -> float:
-        """Be where it is wanted, for a mere point pushes no blood; returns how far that is [m]."""
-        way = math.dist(self.position, self.wanted_position)
-        self.position, self.rotation = self.wanted_position, self.wanted_rotation
-        self._reached = self.wanted_position, self.wanted_rotation
-        return way
+            self._reached = self.target_position, self.target_rotation
 
     @staticmethod
-    def _bounded(way: Floats, arm: float) -> Floats:
-        length = math.hypot(*way)
+    def _bounded(away: Floats, arm: float) -> Floats:
+        length = math.hypot(*away)
         if length * max(arm, 1e-3) < 1e-7:
             return np.zeros(3)
-        speed = length / FOLLOWING
-        return way / length * min(speed, 0.5 * LARGEST_SPEED / max(arm, 1e-3))
+        speed = length / RESPONSE_TIME
+        return away / length * min(speed, 0.5 * LARGEST_SPEED / max(arm, 1e-3))
+
+    def teleport(self) -> float:
+        """Be at the target at once; returns how far that is [m]."""
+        distance = math.dist(self.position, self.target_position)
+        self.position, self.rotation = self.target_position, self.target_rotation
+        self._reached = self.target_position, self.target_rotation
+        return distance
 
     def move(self, dt: float) -> float:
         """Move by a step of dt [s]; returns how far a part of it may have gone [m]."""
         self.position = self.position + dt * self.velocity
         if self.spin.any():
             self.rotation = Rotation.from_rotvec(dt * self.spin) * self.rotation
-        assert self.shape is not None
-        return dt * (math.hypot(*self.velocity) + self.shape.radius * math.hypot(*self.spin))
+        assert self.surface is not None
+        return dt * (math.hypot(*self.velocity) + self.surface.radius * math.hypot(*self.spin))
 
-    def place(self, wall: Wall, neighbors: Neighbors) -> None:
+    def write_proxies(self) -> None:
         """Put the proxies into the wall's last rows."""
-        if self.shape is None:
+        if self.surface is None:
             return
-        arm = self.rotation.apply(self.shape.position)
+        arm = self.rotation.apply(self.surface.position)
         rows = (
             self.position + arm,
-            self.rotation.apply(self.shape.normal),
+            self.rotation.apply(self.surface.normal),
             self.velocity + np.cross(self.spin, arm),
         )
         place_tool(
-            wall, neighbors, *(np.ascontiguousarray(a, float_dtype()) for a in rows),
-            self.shape.volume.astype(float_dtype()), *map(float, self.position), self.shape.radius,
+            self.blood.wall, self.blood.neighbors.tool, self.blood.neighbors.tool_ball,
+            *(np.ascontiguousarray(a, float_dtype()) for a in rows),
+            self.surface.volume.astype(float_dtype()), *map(float, self.position),
+            self.surface.radius,
         )  # fmt: skip
 
+    def compile_kernels(self, model: AccelerationModel) -> None:
+        """Sum the force on the tool, for nothing."""
+        blood = self.blood
+        if blood.wall.tool and model.pair_coefficients is not None:
+            force_on_tool(blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients)
 
-@ti.kernel
-def place_tool(
-    w: ti.template(),
-    nb: ti.template(),
-    position: ti.types.ndarray(ndim=2),
-    normal: ti.types.ndarray(ndim=2),
-    velocity: ti.types.ndarray(ndim=2),
-    volume: ti.types.ndarray(ndim=1),
-    x: float,
-    y: float,
-    z: float,
-    radius: float,
-):
-    """Writes: the wall's rows from count on, and what the lists know of them."""
-    nb.tool_ball[0] = x
-    nb.tool_ball[1] = y
-    nb.tool_ball[2] = z
-    nb.tool_ball[3] = radius
-    for k in range(volume.shape[0]):
-        for a in ti.static(range(3)):
-            w.position[w.count + k][a] = position[k, a]
-            w.normal[w.count + k][a] = normal[k, a]
-            w.velocity[w.count + k][a] = velocity[k, a]
-        w.volume[w.count + k] = volume[k]
-        nb.tool.x[k] = position[k, 0]
-        nb.tool.y[k] = position[k, 1]
-        nb.tool.z[k] = position[k, 2]
+    def reset(self) -> None:
+        """At home and at rest."""
+        self.position = self.target_position = self.home
+        self.rotation = self.target_rotation = Rotation.identity()
+        self.velocity, self.spin = np.zeros(3), np.zeros(3)
+        self.last_displacement, self._reached = 0.0, (None, None)
+        self.write_proxies()
+
+    def save_state(self) -> dict[str, Any]:
+        """Pose, target and motion; rotations as quaternions x, y, z, w."""
+        return {
+            name: [float(x) for x in value]
+            for name, value in (
+                ("position", self.position), ("rotation", self.rotation.as_quat()),
+                ("target_position", self.target_position),
+                ("target_rotation", self.target_rotation.as_quat()),
+                ("velocity", self.velocity), ("spin", self.spin),
+            )
+        }  # fmt: skip
+
+    def load_state(self, saved: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        rows = {name: np.array(row) for name, row in saved.items()}
+        self.position, self.target_position = rows["position"], rows["target_position"]
+        self.rotation = Rotation.from_quat(rows["rotation"])
+        self.target_rotation = Rotation.from_quat(rows["target_rotation"])
+        self.velocity, self.spin = rows["velocity"], rows["spin"]
+        self.write_proxies()

@@ -1,27 +1,50 @@
 """Particles: the blood's state in Taichi fields."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import taichi as ti
 
 from taichi_sph.errors import RunError
-from taichi_sph.runtime import float_dtype
+from taichi_sph.runtime import float_dtype, require_runtime, runtime_number
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True)
+class Quantity:
+    """One thing that each particle carries: sorted, saved, loaded and, if said, hashed with it."""
+
+    name: str
+    kind: Literal["scalar", "vector", "integer"] = "scalar"
+    """A float, three of them, or a 32-bit integer."""
+    in_digest: bool = False
+    """Whether a replay's digest covers it."""
+
+    def make_field(self, rows: int) -> Any:
+        """A field of so many zeros."""
+        if self.kind == "vector":
+            return ti.Vector.field(3, float, rows)
+        return ti.field(int if self.kind == "integer" else float, rows)
+
+
+QUANTITIES = (
+    Quantity("identity", "integer", in_digest=True),
+    Quantity("position", "vector", in_digest=True),
+    Quantity("velocity", "vector", in_digest=True),
+    Quantity("acceleration", "vector"),
+    Quantity("density"),
+)
+"""What every particle has, in the order in which the digest takes it; more follow after these."""
+
+
 class Particles:
     """Blood particles; rows 0..count-1 are live, in the order of the neighbour grid.
 
-    Rows move whenever the grid is rebuilt: `identity` says which particle a row holds.
+    Rows move whenever the grid is rebuilt: `identity` says which particle a row holds.  Each
+    quantity is a field of its name.
     """
 
-    capacity: int
-    """Rows allocated."""
-    mass: float
-    """Blood that a particle stands for, rho_0 d^3 [kg]."""
-    count: ti.Field
-    """Number of live particles, 0-D."""
     position: ti.MatrixField
     """x [m], shape (capacity,)."""
     velocity: ti.MatrixField
@@ -33,28 +56,37 @@ class Particles:
     identity: ti.Field
     """Number of the particle, the same for its whole life, shape (capacity,)."""
 
-    @classmethod
-    def allocate(cls, capacity: int, mass: float) -> "Particles":
-        """Make the fields; once a run, since Taichi frees none."""
-        return cls(
-            capacity=capacity,
-            mass=mass,
-            count=ti.field(int, ()),
-            position=ti.Vector.field(3, float, capacity),
-            velocity=ti.Vector.field(3, float, capacity),
-            acceleration=ti.Vector.field(3, float, capacity),
-            density=ti.field(float, capacity),
-            identity=ti.field(int, capacity),
-        )
+    def __init__(self, capacity: int, mass: float, more: Sequence[Quantity] = ()):
+        """Make the fields; once a run, since Taichi frees none.
+
+        Args:
+            capacity: rows.
+            mass: blood that a particle stands for, rho_0 d^3 [kg].
+            more: what a particle has beside QUANTITIES.
+        """
+        self.capacity = capacity
+        self.mass = mass
+        self.quantities = (*QUANTITIES, *more)
+        self.count = ti.field(int, ())
+        """Number of live particles, 0-D."""
+        self.fields = tuple(q.make_field(capacity) for q in self.quantities)
+        """One for each quantity, in their order."""
+        for quantity, field in zip(self.quantities, self.fields, strict=True):
+            setattr(self, quantity.name, field)
+        # A sort copies all rows but positions, which the lists hold, through these.
+        moved = [k for k, q in enumerate(self.quantities) if q.name != "position"]
+        self.sorted_fields = tuple(self.fields[k] for k in moved)
+        self.scratch = tuple(self.quantities[k].make_field(capacity) for k in moved)
+        self._runtime = runtime_number()
 
     @classmethod
     def from_numpy(
         cls, position: np.ndarray, velocity: np.ndarray | None = None, mass: float = 1.0,
-        room: int = 0,
+        room: int = 0, more: Sequence[Quantity] = (),
     ) -> "Particles":  # fmt: skip
         """Particles at given positions [m] and velocities [m/s] (at rest), shape (n, 3).
 
-        There is room for so many more.
+        There is room for so many more; `more` is what they have beside QUANTITIES.
 
         Raises:
             RunError: a position or velocity is not finite.
@@ -63,30 +95,53 @@ class Particles:
         velocity = np.zeros((n, 3)) if velocity is None else velocity
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise RunError("initial positions and velocities must be finite numbers")
-        particles = cls.allocate(n + room, mass)
+        particles = cls(n + room, mass, more)
         # One kernel for all: each field's own would cost some 0.05 s at start.
         place_rows(
             particles, *(np.ascontiguousarray(a, float_dtype()) for a in (position, velocity))
         )
         return particles
 
-    def replace(self, **rows: np.ndarray) -> None:
-        """Other live rows: fields by name, each (n,) or (n, 3) with the same n <= capacity."""
-        for name, values in rows.items():
-            field = getattr(self, name)
-            whole = field.to_numpy()
-            whole[: len(values)] = values
+    def replace(self, rows: Mapping[str, np.ndarray]) -> None:
+        """Replace the blood: quantities by name, each (n,) or (n, 3) with the same n <= capacity.
+
+        Quantities that are not given are zero.
+        """
+        require_runtime(self._runtime)
+        for quantity, field in zip(self.quantities, self.fields, strict=True):
+            whole = np.zeros_like(field.to_numpy())
+            if quantity.name in rows:
+                whole[: len(rows[quantity.name])] = rows[quantity.name]
             field.from_numpy(whole)
-            self.count[None] = len(values)
+        self.count[None] = len(rows["identity"])
+
+    def rows(self) -> dict[str, np.ndarray]:
+        """Copies of all quantities by name, (n,) or (n, 3), in the order of the grid."""
+        require_runtime(self._runtime)
+        n = int(self.count[None])
+        return {
+            quantity.name: field.to_numpy()[:n]
+            for quantity, field in zip(self.quantities, self.fields, strict=True)
+        }
+
+    def digested_rows(self) -> list[np.ndarray]:
+        """Copies of what a replay's digest covers, in the order of the quantities."""
+        identity, position, velocity = self.live()
+        n, more = len(identity), zip(self.quantities[len(QUANTITIES) :],
+                                     self.fields[len(QUANTITIES) :], strict=True)  # fmt: skip
+        rows = [field.to_numpy()[:n] for quantity, field in more if quantity.in_digest]
+        return [identity, position, velocity, *rows]
 
     def in_order(self, field: ti.Field) -> np.ndarray:
         """Copy of a field's live rows, sorted by identity."""
+        require_runtime(self._runtime)
         n = self.count[None]
         order = np.argsort(self.identity.to_numpy()[:n])
         return field.to_numpy()[:n][order]
 
     def live(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Copies of identities (n,), positions [m] and velocities [m/s], (n, 3), as `copy_to`."""
+        require_runtime(self._runtime)
         n = int(self.count[None])
         identity = np.empty(n, np.int32)
         position, velocity = (np.empty((n, 3), float_dtype()) for _ in range(2))
@@ -104,11 +159,13 @@ class Particles:
         Returns:
             how many rows were written: what there is, or m if that is less.
         """
+        require_runtime(self._runtime)
         copy_rows(self, identity, position, velocity)
         return min(int(self.count[None]), len(identity))
 
     def identities(self) -> np.ndarray:
         """Live identities, ascending, shape (n,)."""
+        require_runtime(self._runtime)
         return np.sort(self.identity.to_numpy()[: self.count[None]])
 
 

@@ -1,6 +1,6 @@
 """The wall: a layer of proxy particles behind the lumen surface (paper, 1.1).
 
-They stand still, or move out and back along their normals as the vessel's pulse wants it.
+They stand still, or move out and back along their normals as the vessel's wall motion wants it.
 """
 
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
+from taichi_sph.particles.grid import Points
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 
 
@@ -17,19 +18,19 @@ class Proxies(NamedTuple):
     """Proxies in any order, on the host."""
 
     position: np.ndarray
-    """x_k [m], (m, 3); of a wall that pulses, at its narrowest."""
+    """x_k [m], (m, 3); of a wall that moves, at its narrowest."""
     normal: np.ndarray
     """Unit normal out of the lumen, (m, 3)."""
     volume: np.ndarray
     """V_k of Eq. 3 with gamma = 1 [m^3], (m,)."""
-    swing: np.ndarray
-    """How far a proxy moves along its normal in a pulse [m], (m,)."""
+    amplitude: np.ndarray
+    """How far a proxy moves along its normal, from narrow to wide [m], (m,)."""
     wide_volume: np.ndarray
     """V_k where all have moved as far [m^3], (m,)."""
 
-    def at(self, level: float) -> np.ndarray:
-        """Positions [m], (m, 3), at a level of the pulse, 0 narrow to 1 wide."""
-        return np.asarray(self.position + level * self.swing[:, None] * self.normal)
+    def at(self, factor: float) -> np.ndarray:
+        """Positions [m], (m, 3), at a displacement factor, 0 narrow to 1 wide."""
+        return np.asarray(self.position + factor * self.amplitude[:, None] * self.normal)
 
 
 @dataclass(eq=False)
@@ -50,8 +51,8 @@ class Wall:
     """V_k of Eq. 3 with gamma = 1 [m^3], shape (max(count, 1),)."""
     given: Proxies
     """The same in the order in which they were given; the lists put them into the fields."""
-    swing: ti.MatrixField
-    """Way from narrow to wide [m], shape as position where the wall pulses, else (1,)."""
+    displacement: ti.MatrixField
+    """From narrow to wide [m], shape as position where the vessel's wall moves, else (1,)."""
     narrow: ti.MatrixField
     """Position at the narrowest [m], likewise."""
     narrow_volume: ti.Field
@@ -62,22 +63,22 @@ class Wall:
     """Proxies of a tool: rows count to count + tool, which no cell holds."""
     velocity: ti.MatrixField
     """v_k [m/s], shape as position where proxies move, else (1,)."""
-    most_swing: float = 0.0
-    """Of any proxy [m]."""
-    level: float = 0.0
-    """Where the pulse is, 0 narrow to 1 wide."""
+    largest_amplitude: float = 0.0
+    """The farthest that any of the vessel's proxies moves from narrow to wide [m]."""
+    displacement_factor: float = 0.0
+    """Where the vessel's wall is, 0 narrow to 1 wide."""
     rate: float = 0.0
-    """Its rate [1/s]."""
+    """Rate of the displacement factor [1/s]."""
 
     @property
     def moves(self) -> bool:
         """Whether any proxy may move."""
-        return self.tool > 0 or self.pulses
+        return self.tool > 0 or self.vessel_moves
 
     @property
-    def pulses(self) -> bool:
+    def vessel_moves(self) -> bool:
         """Whether the vessel's own proxies move."""
-        return self.most_swing > 0.0
+        return self.largest_amplitude > 0.0
 
     @classmethod
     def from_numpy(
@@ -89,22 +90,24 @@ class Wall:
         spacing: float,
         period: np.ndarray | None = None,
         tool: int = 0,
-        swing: np.ndarray | None = None,
+        amplitude: np.ndarray | None = None,
     ) -> "Wall":
         """Proxies at given positions [m] and outward normals, shape (m, 3).
 
         `period` [m] repeats the wall along the axes where it is not zero; there is room for the
-        proxies of a tool.  `swing` [m], (m,), is the way of each along its normal in a pulse.
+        proxies of a tool.  `amplitude` [m], (m,), is how far each moves along its normal.
         """
         m = len(position)
         rows = max(m + tool, 1)
         volume = proxy_volumes(position, kernel, period) if m else np.zeros(0)
-        most = 0.0 if swing is None else float(swing.max(initial=0.0))
+        most = 0.0 if amplitude is None else float(amplitude.max(initial=0.0))
         given = Proxies(position, normal, volume, np.zeros(m), volume)
-        if swing is not None and most > 0.0:
-            wide = position + swing[:, None] * normal
-            given = Proxies(position, normal, volume, swing, proxy_volumes(wide, kernel, period))
-        moving, pulsing = rows if tool or most else 1, rows if most else 1
+        if amplitude is not None and most > 0.0:
+            wide = position + amplitude[:, None] * normal
+            given = given._replace(
+                amplitude=amplitude, wide_volume=proxy_volumes(wide, kernel, period)
+            )
+        moving, swaying = rows if tool or most else 1, rows if most else 1
         return cls(
             count=m,
             setback=setback,
@@ -113,14 +116,24 @@ class Wall:
             normal=ti.Vector.field(3, float, rows),
             volume=ti.field(float, rows),
             given=given,
-            swing=ti.Vector.field(3, float, pulsing),
-            narrow=ti.Vector.field(3, float, pulsing),
-            narrow_volume=ti.field(float, pulsing),
-            wide_volume=ti.field(float, pulsing),
+            displacement=ti.Vector.field(3, float, swaying),
+            narrow=ti.Vector.field(3, float, swaying),
+            narrow_volume=ti.field(float, swaying),
+            wide_volume=ti.field(float, swaying),
             tool=tool,
             velocity=ti.Vector.field(3, float, moving),
-            most_swing=most,
+            largest_amplitude=most,
         )
+
+
+def move_wall(wall: Wall, points: Points, factor: float, rate: float) -> None:
+    """Put a wall that moves at a displacement factor, 0 narrow to 1 wide, with its rate [1/s].
+
+    `points` are its proxies as the lists know them.
+    """
+    wall.displacement_factor, wall.rate = factor, rate
+    if wall.vessel_moves:
+        move_proxies(wall, points, len(wall.given.position), factor, rate)
 
 
 @ti.func
@@ -130,6 +143,82 @@ def wall_velocity(w: ti.template(), k):
     if ti.static(w.moves):
         v = w.velocity[k]
     return v
+
+
+@ti.kernel
+def place_proxies(
+    w: ti.template(),
+    points: ti.template(),
+    position: ti.types.ndarray(ndim=2),
+    normal: ti.types.ndarray(ndim=2),
+    volume: ti.types.ndarray(ndim=1),
+    amplitude: ti.types.ndarray(ndim=1),
+    wide_volume: ti.types.ndarray(ndim=1),
+):
+    """Proxies in the order of the grid.  Writes: the wall's fields, points."""
+    for k in range(volume.shape[0]):
+        for a in ti.static(range(3)):
+            w.position[k][a] = position[k, a]
+            w.normal[k][a] = normal[k, a]
+        w.volume[k] = volume[k]
+        if ti.static(w.vessel_moves):
+            w.narrow[k] = w.position[k]
+            w.displacement[k] = amplitude[k] * w.normal[k]
+            w.narrow_volume[k] = volume[k]
+            w.wide_volume[k] = wide_volume[k]
+        points.x[k] = position[k, 0]
+        points.y[k] = position[k, 1]
+        points.z[k] = position[k, 2]
+
+
+@ti.kernel
+def move_proxies(w: ti.template(), points: ti.template(), count: int, factor: float, rate: float):
+    """x_k = narrow + factor displacement, v_k = rate displacement.
+
+    V_k (Eq. 3) is on a line between its values at the narrowest and at the widest; the normals are
+    those at the narrowest.  Writes: position, velocity, volume, points.
+    """
+    for k in range(count):
+        x = w.narrow[k] + factor * w.displacement[k]
+        w.position[k] = x
+        w.velocity[k] = rate * w.displacement[k]
+        w.volume[k] = w.narrow_volume[k] + factor * (w.wide_volume[k] - w.narrow_volume[k])
+        points.x[k] = x[0]
+        points.y[k] = x[1]
+        points.z[k] = x[2]
+
+
+@ti.kernel
+def place_tool(
+    w: ti.template(),
+    points: ti.template(),
+    ball: ti.template(),
+    position: ti.types.ndarray(ndim=2),
+    normal: ti.types.ndarray(ndim=2),
+    velocity: ti.types.ndarray(ndim=2),
+    volume: ti.types.ndarray(ndim=1),
+    x: float,
+    y: float,
+    z: float,
+    radius: float,
+):
+    """Put a tool's proxies into the wall's rows from count on, and where the lists look for them.
+
+    Writes: position, normal, velocity, volume, points, ball.
+    """
+    ball[0] = x
+    ball[1] = y
+    ball[2] = z
+    ball[3] = radius
+    for k in range(volume.shape[0]):
+        for a in ti.static(range(3)):
+            w.position[w.count + k][a] = position[k, a]
+            w.normal[w.count + k][a] = normal[k, a]
+            w.velocity[w.count + k][a] = velocity[k, a]
+        w.volume[w.count + k] = volume[k]
+        points.x[k] = position[k, 0]
+        points.y[k] = position[k, 1]
+        points.z[k] = position[k, 2]
 
 
 def proxy_volumes(

@@ -15,15 +15,17 @@ import numpy as np
 import taichi as ti
 
 from reference import Blood
+from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.fluid.calibration import Calibration, calibrate
 from taichi_sph.fluid.equation_of_state import Tait
 from taichi_sph.fluid.rheology import Newtonian
 from taichi_sph.fluid.wcsph import Fluid, SphAcceleration
-from taichi_sph.motion import Motion
-from taichi_sph.particles.neighbors import Neighbors, make_grid
+from taichi_sph.particles.grid import make_grid
+from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Proxies, Wall, proxy_volumes
+from taichi_sph.simulation import Simulation
 
 D = 1e-3
 """Spacing of blood [m]."""
@@ -131,16 +133,13 @@ class Setup:
     ) -> None:
         """Replace the blood; row k gets identity k unless told otherwise."""
         n = len(position)
-        rows = np.zeros((3, CAPACITY, 3), float_dtype())
-        rows[0, :n] = position
-        rows[1, :n] = 0.0 if velocity is None else velocity
-        names = np.full(CAPACITY, -1, np.int32)
-        names[:n] = np.arange(n) if identity is None else identity
-        p = self.particles
-        for target, values in zip((p.position, p.velocity, p.acceleration), rows, strict=True):
-            target.from_numpy(values)
-        p.identity.from_numpy(names)
-        p.count[None] = n
+        self.particles.replace(
+            {
+                "identity": np.arange(n) if identity is None else identity,
+                "position": position,
+                "velocity": np.zeros((n, 3)) if velocity is None else velocity,
+            }
+        )
 
     def put_wall(self, position: np.ndarray, normal: np.ndarray) -> None:
         """Replace the proxies (as many) and sort them."""
@@ -162,10 +161,17 @@ class Setup:
         """Live rows of a field in order of identity, double precision."""
         return self.particles.in_order(field).astype(float)
 
-    def motion(self, model, gravity=(0.0, 0.0, 0.0), speed_limit=1e9, **options) -> Motion:
-        """A motion of what is on the stage."""
-        return Motion(
-            self.particles, self.wall, self.neighbors, model, gravity, speed_limit, **options
+    def blood(self, gravity=(0.0, 0.0, 0.0)) -> BloodFlow:
+        """What boundaries act upon."""
+        return BloodFlow(self.particles, self.wall, self.neighbors, gravity)
+
+    def simulation(
+        self, model, gravity=(0.0, 0.0, 0.0), speed_limit=1e9, integrator="symplectic",
+        boundaries: tuple[Boundary, ...] = (),
+    ) -> Simulation:  # fmt: skip
+        """A simulation of what is on the stage."""
+        return Simulation(
+            self.blood(gravity), model, boundaries, speed_limit=speed_limit, integrator=integrator
         )
 
     def reference(self, fluid: Fluid) -> Blood:
@@ -191,7 +197,7 @@ class Setup:
 
 @cache
 def _particles() -> Particles:
-    return Particles.allocate(CAPACITY, calibration().mass)
+    return Particles(CAPACITY, calibration().mass)
 
 
 def _stage(lower, upper, period, reach, position, normal) -> Setup:

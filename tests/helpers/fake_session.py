@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from app.control.commands import as_dict, parse_command
 from app.scenes.library import shipped
-from taichi_sph.boundary.surgery import Wound
+from taichi_sph.boundary.wounds import Wound
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.vessel import read_vessel
 from taichi_sph.scene import read_scene
@@ -40,12 +40,13 @@ class FakeSession:
         low, high = self.vessel.bounds
         middle = 0.5 * (low + high)
         self.wounds: list[Wound] = []
-        self.tool = SimpleNamespace(shape=shape, position=middle, rotation=Rotation.identity())
+        self.tool = SimpleNamespace(surface=shape, position=middle, rotation=Rotation.identity())
         self.simulation: Any = SimpleNamespace(
             scene=self.scene,
             vessel=self.vessel,
             derived=SimpleNamespace(expected_speed=1.0),
-            surgery=SimpleNamespace(tool=self.tool, wounds=self.wounds),
+            tool=self.tool,
+            wounds=self.wounds,
             model=SimpleNamespace(name="physics"),
         )
         self.models = {"physics": None, "implicit": None, "pcnet": None}

@@ -47,9 +47,10 @@ class FakeSimulation:
         self.start = random.uniform(low, high, (particles, 3))
         self.velocity = np.zeros((particles, 3), np.float32)
         self.velocity[:, 2] = -np.linspace(0.0, 1.0, particles)
-        tool = SimpleNamespace(shape=None, position=np.zeros(3))
-        self.pulse = None
-        self.surgery = SimpleNamespace(wounds=[], tool=tool, suction_rate=0.0)
+        self.tool = SimpleNamespace(surface=None, position=np.zeros(3))
+        self.wall_motion = None
+        self.wounds: list[Any] = []
+        self.suction = SimpleNamespace(rate=0.0)
 
     def advance_to(self, time: float, before_step: Callable[[], None] | None = None) -> None:
         clock.sleep(self.pause)

@@ -38,6 +38,11 @@ def separations(x: np.ndarray, y: np.ndarray, period: np.ndarray | None = None) 
     return r
 
 
+def between(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Distances of points (n, k) to points (m, k), (n, m)."""
+    return np.linalg.norm(x[:, None] - y[None], axis=2)
+
+
 def proxy_volumes(y: np.ndarray, support: float, period: np.ndarray | None = None) -> np.ndarray:
     """Eq. 3 with gamma = 1: V_k = 1 / sum_l W(y_k - y_l), itself included [m^3]."""
     return 1.0 / wendland(np.linalg.norm(separations(y, y, period), axis=-1), support).sum(axis=1)

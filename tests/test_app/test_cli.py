@@ -140,13 +140,13 @@ def test_positions_recorded_are_those_of_the_simulation(scene: Path, tmp_path: P
     # Begun again from the same blood, it does the same: to rounding, for sums go by another order.
     end = simulation.positions()
     start = keeper.positions[0]
-    simulation.place(start, np.zeros_like(start))
+    simulation.restart_with(start, np.zeros_like(start))
     assert (simulation.time, simulation.steps) == (0.0, 0)
     for frame in (1, 2, 3):
         simulation.advance_to(0.002 * frame)
     assert np.abs(simulation.positions() - end).max() < 1e-9
     with pytest.raises(InputError, match="there is room for"):
-        simulation.place(np.concatenate([start, start]), np.zeros((2 * len(start), 3)))
+        simulation.restart_with(np.concatenate([start, start]), np.zeros((2 * len(start), 3)))
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

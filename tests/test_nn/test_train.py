@@ -51,8 +51,8 @@ def stage() -> ReplaySimulation:
             (state.velocity + 0.05 * noise).astype(state.velocity.dtype),
             state.alive,
         ),
-        stage.time,
-        stage.steps,
+        stage.simulation.time,
+        stage.simulation.steps,
     )
     return stage
 
@@ -66,8 +66,8 @@ def course(box: Path) -> Iterator[TrainingRuns]:
 
 @pytest.mark.parametrize(("head", "rounds"), [("direct", 0), ("pressure", 0), ("pressure", 2)])
 def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precision):
-    d, radius = stage.scene.discretization.spacing, stage.fluid.kernel.support_radius
-    sound = stage.derived.sound_speed
+    d, radius = stage.simulation.scene.discretization.spacing, stage.fluid.kernel.support_radius
+    sound = stage.simulation.derived.sound_speed
     scales = FeatureScales(radius, d, 2e-4, sound)
     training = Training(
         head, INPUTS[head], d, radius, 2e-4, 4, rounds, sound, 1.0, 0.05, 17.3, "bp", 0, "tube", ""
@@ -75,7 +75,7 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     torch.manual_seed(1)
     features = stage.features(scales)[:, training.columns.index]
     model = Model(training, features.mean(axis=0), np.maximum(features.std(axis=0), 1e-2), 0.7)
-    n = stage.particles.count[None]
+    n = stage.simulation.particles.count[None]
     sample = TrainingSample(
         stage, scales, np.zeros((n, 3)), np.ones(n, bool), pairs=head == "pressure"
     )
@@ -84,11 +84,16 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
         down = torch.tensor((0.0, 0.0 if head == "direct" else -9.81, 0.0))
         density, eta = fluid.equation_of_state.rest_density, fluid.rheology.eta
         expected = model.step(sample, density, eta, down).acceleration.numpy()
-    net = make_pcnet(model.weights(), stage.fluid, scales, stage.particles.capacity)
+    net = make_pcnet(model.weights(), stage.fluid, scales, stage.simulation.particles.capacity)
     if isinstance(net, DirectPcNet):
         net.guarded = False
-    net.accelerate(stage.particles, stage.wall, stage.neighbors, (0.0, -9.81, 0.0))
-    found = stage.particles.acceleration.to_numpy()[:n]
+    net.accelerate(
+        stage.simulation.particles,
+        stage.simulation.wall,
+        stage.simulation.neighbors,
+        (0.0, -9.81, 0.0),
+    )
+    found = stage.simulation.particles.acceleration.to_numpy()[:n]
     scale = np.abs(expected).max()
     assert scale > 0.0
     assert np.abs(found - expected).max() < CLOSE[precision] * scale
@@ -97,11 +102,16 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
 def one_step_error(course: TrainingRuns, weights: Weights) -> float:
     """Root mean square error of the acceleration over the held-out run [m/s^2]."""
     run, net, wrong = course.held[0], course.pcnet(weights), []
-    particles = course.stage.particles
+    particles = course.stage.simulation.particles
     for frame in range(20, len(run), 8):
         course.put(run, frame)
-        course.stage.model = net
-        net.accelerate(particles, course.stage.wall, course.stage.neighbors, course.scene.gravity)
+        course.stage.simulation.model = net
+        net.accelerate(
+            particles,
+            course.stage.simulation.wall,
+            course.stage.simulation.neighbors,
+            course.scene.gravity,
+        )
         n = particles.count[None]
         identity = particles.identity.to_numpy()[:n]
         valid = run.has_target(frame)[identity]

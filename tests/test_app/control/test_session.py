@@ -76,7 +76,7 @@ def test_a_tool_is_wanted_inside_the_box_only(session):
     session.offer(as_dict(Tool(position=(9.0, 0.0, 0.0))), "test")
     session.before_step()
     low, high = session.simulation.bounds
-    assert session.simulation.surgery.tool.wanted_position.tolist() == [high[0], 0.0, 0.0]
+    assert session.simulation.tool.target_position.tolist() == [high[0], 0.0, 0.0]
     assert (low < high).all()
 
 
@@ -173,12 +173,13 @@ def test_reset_puts_everything_back_but_the_clock(session):
         session.offer(command, "test")
     simulation.advance_to(simulation.time + 2e-3, session.before_step)
     time, count = simulation.time, len(start)
-    assert simulation.surgery.wounds and not np.array_equal(simulation.positions()[:count], start)
+    assert len(simulation.wounds) and not np.array_equal(simulation.positions()[:count], start)
     session.offer(as_dict(Reset()), "test")
     session.before_step()
-    assert simulation.time == time and not simulation.surgery.wounds
+    assert simulation.time == time and not len(simulation.wounds)
     assert np.array_equal(simulation.positions(), start)
-    assert simulation.exits.account().sum() == 0 and simulation.pistons[0].asked == 1.0
+    assert simulation.outlets.outflow_counts().sum() == 0
+    assert simulation.inflow.openings[0].target_factor == 1.0
 
 
 def test_auto_leaves_pcnet_where_blood_is_denser_than_its_training_and_comes_back(session):

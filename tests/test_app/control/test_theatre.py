@@ -58,7 +58,7 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed")
     simulation, session = theatre.simulation, theatre.session
-    surgery, scene = simulation.surgery, simulation.scene
+    scene, tool, suction = simulation.scene, simulation.tool, simulation.suction
     page = ControlPage(session, port=0)
     session.refusals.append(page.tell)
     browser = Browser(page, np.asarray(simulation.vessel.vertices, float), scene.gravity)
@@ -83,19 +83,19 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         wait_until(lambda: abs(simulation.gravity[2]) < 1e-6)
         assert np.linalg.norm(simulation.gravity) == pytest.approx(9.81)
         browser.enter("top", 0.5)
-        wait_until(lambda: [p.asked for p in simulation.pistons] == [0.5, 1.0])
-        place = surgery.tool.wanted_position
+        wait_until(lambda: [o.target_factor for o in simulation.inflow.openings] == [0.5, 1.0])
+        place = tool.target_position
         right = page._right
         browser.pull(page._grip, np.eye(3)[int(np.abs(right).argmax())])
-        wait_until(lambda: not np.array_equal(surgery.tool.wanted_position, place))
+        wait_until(lambda: not np.array_equal(tool.target_position, place))
         browser.enter("rate [ml/min]", 120)
         browser.find('//label[.="suction"]/following::input[1]').click()
-        wait_until(lambda: surgery.suction_rate == pytest.approx(2e-6))
+        wait_until(lambda: suction.rate == pytest.approx(2e-6))
         browser.find('//label[.="suction"]/following::input[1]').click()
-        wait_until(lambda: surgery.suction_rate == 0.0)
+        wait_until(lambda: suction.rate == 0.0)
 
         browser.press("Wound here")
-        wait_until(lambda: surgery.wounds)
+        wait_until(lambda: len(simulation.wounds))
         browser.enter("speed limit", 0.5)
         wait_until(lambda: session.speed == 0.5)
         browser.press("go on")
@@ -104,9 +104,9 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         wait_until(lambda: session.figures()["lost"] > 0.0, patience=60.0)
         browser.find("//td[.='lost blood']/following::td[1][not(.='0.00 ml')]")
         browser.press("Clamp")
-        wait_until(lambda: not surgery.wounds[0].is_open)
+        wait_until(lambda: not next(iter(simulation.wounds)).is_open)
         browser.press("reset")
-        wait_until(lambda: not surgery.wounds)
+        wait_until(lambda: not len(simulation.wounds))
         wait_until(lambda: simulation.gravity == scene.gravity)
     finally:
         browser.driver.quit()

@@ -15,8 +15,6 @@ from app.run.checkpoint import Checkpoint, Checkpointer, difference
 from commands import HERE, vesselflow
 from taichi_sph.errors import InputError
 
-ARRAYS = ("identity", "position", "velocity", "acceleration", "density", "removed")
-
 
 def same(a: Path, b: Path) -> bool:
     """Whether two checkpoints hold bitwise the same state at the same frame."""
@@ -25,11 +23,17 @@ def same(a: Path, b: Path) -> bool:
         one.frame == other.frame
         and one.state.time == other.state.time
         and one.state.steps == other.state.steps
+        and one.state.particles.keys() == other.state.particles.keys()
         and all(
-            getattr(one.state, name).tobytes() == getattr(other.state, name).tobytes()
-            for name in ARRAYS
+            rows.tobytes() == other.state.particles[name].tobytes()
+            for name, rows in one.state.particles.items()
         )
+        and (removed(one) == removed(other)).all()
     )
+
+
+def removed(checkpoint: Checkpoint) -> np.ndarray:
+    return np.asarray(checkpoint.state.boundaries["outlets"]["removed"])
 
 
 def arguments(box: Path, model: str, frames: int) -> list[str]:

@@ -88,7 +88,7 @@ def recorded(make: Maker, tmp_path_factory: pytest.TempPathFactory) -> Recording
 def test_a_state_says_all_that_its_future_needs(scene_file: Path) -> None:
     scene = read_scene(scene_file)
     simulation = ReplaySimulation(scene, read_vessel(scene), 0)
-    interval = 2 * simulation.derived.step  # lists last longer than that
+    interval = 2 * simulation.simulation.derived.step  # lists last longer than that
 
     def advance(frame: int) -> RecordedState:
         simulation.advance_to(frame * interval)

@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from app.validation.pipes import harmonic
 from app.validation.report import Curve, Report, Row, relative_l2, watched
 from app.validation.validate import CASES, Case, main, table_of
 from taichi_sph.errors import InputError
-from taichi_sph.motion import Motion
 
 
 def test_an_unknown_case_is_refused_with_the_names_that_exist():
@@ -63,8 +63,8 @@ def test_a_harmonic_is_found_beside_a_constant_and_another_one():
     assert harmonic(time, values, w) == pytest.approx(amplitude)
 
 
-class Clock(Motion):
-    """Stands in for a `Motion`: steps of at most 0.4 s; remembers the force of each."""
+class Clock:
+    """Stands in for a `Simulation`: steps of at most 0.4 s; remembers the force of each."""
 
     def __init__(self):
         self.time, self.steps, self.gravity = 0.0, 0, (0.0, 0.0, 0.0)
@@ -77,7 +77,7 @@ class Clock(Motion):
 
 
 def test_a_changing_force_is_set_anew_before_each_step():
-    clock = Clock()
+    clock: Any = Clock()
     assert list(watched(clock, [0.6, 1.0], Report(lambda f: None), 0.0, 1.0, lambda t: -t)) == [
         0,
         1,

@@ -37,7 +37,7 @@ from recordings import (
     static,
     verify,
 )
-from taichi_sph.boundary.surgery import Wound
+from taichi_sph.boundary.wounds import Wound
 from taichi_sph.errors import InputError
 
 FAKE = ROOT / "tests" / "helpers" / "fake_simulation.py"
@@ -98,13 +98,14 @@ def test_the_recording_holds_what_the_simulation_showed(simulation: Any, tmp_pat
 
 
 def test_wounds_and_the_tip_are_shown_until_they_are_gone(simulation: Any, tmp_path: Path) -> None:
-    file, surgery = tmp_path / "run.rrd", simulation.surgery
+    file = tmp_path / "run.rrd"
     at, normal = np.array([0.0, 1e-3, 2e-3]), np.array([0.0, 0.0, 1.0])
-    simulation.drops = lambda: np.ones((3, 3), np.float32)
+    droplets = np.ones((3, 3), np.float32)
+    simulation.outlets = SimpleNamespace(droplets=lambda: droplets)
     view = RerunView(simulation, file)
     for frame in range(3):
-        surgery.wounds = [Wound(at, at, normal, 1e-3)] if frame == 1 else []
-        surgery.suction_rate, surgery.suction_radius = 1e-6 * (frame == 1), 2e-3
+        simulation.wounds = [Wound(at, at, normal, 1e-3)] if frame == 1 else []
+        simulation.suction = SimpleNamespace(rate=1e-6 * (frame == 1), radius=2e-3)
         view.on_frame(simulation, frame, simulation.diagnostics())
     view.close("finished")
     rims = rows(file, "/world/wounds", "LineStrips3D:strips")

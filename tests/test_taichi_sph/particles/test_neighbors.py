@@ -25,7 +25,8 @@ from builders import (
 from reference import proxy_volumes, separations
 from taichi_sph.errors import RunError
 from taichi_sph.fluid.rheology import Casson
-from taichi_sph.particles.neighbors import Neighbors, cells_within, list_capacity, make_grid
+from taichi_sph.particles.grid import cells_within, make_grid
+from taichi_sph.particles.neighbors import Neighbors, list_capacity
 
 ROUNDING = {"f64": 1e-12, "f32": 1e-5}
 """Pairs this near to the radius, relatively, may be told either way."""

@@ -1,21 +1,19 @@
-"""Surgery: what is done to the vessel while blood flows: wounds, clamps, a tool, suction."""
+"""Wounds: holes in the vessel's wall that are opened and closed while blood flows."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from taichi_sph.boundary.outlets import Outlets, suck
-from taichi_sph.boundary.tool import Tool
+from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Booleans, Floats, plane_axes
 from taichi_sph.geometry.vessel import Vessel
-from taichi_sph.particles.neighbors import Neighbors
-from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
-from taichi_sph.particles.wall import Proxies, Wall, refreshed_volumes
+from taichi_sph.particles.wall import Proxies, refreshed_volumes
 
 MOST_WOUNDS = 16
 """Wounds of a session, closed ones too: each keeps its account."""
@@ -26,12 +24,12 @@ LEAST_RADIUS = 1.5
 OUTSIDE = 1.0
 """Blood has left by a wound when it is this far beyond the wall [spacings]."""
 
-SEATED = 0.6
+SEATED_DISTANCE = 0.6
 """Where a wound is closed, blood nearer to the wall than this has left [spacings]: at rest it keeps
 half a spacing, and what a proxy comes down upon is thrown out."""
 
-ASIDE = 3.0
-"""And no farther from the wound's rim than this [spacings]: nearer blood is of the jet."""
+RIM_CLEARANCE = 3.0
+"""Blood has left by a wound no farther from its rim than this [spacings]: that is the jet."""
 
 
 @dataclass
@@ -78,33 +76,43 @@ class Wound:
         return float(np.pi) * self.radius**2 + 2.0 * self.radius * length
 
 
-class Surgery:
-    """Wounds, tool and suction of one simulation."""
+class Wounds(Boundary):
+    """The wounds of one simulation, in the order in which they were opened."""
+
+    name = "wounds"
 
     def __init__(
-        self, vessel: Vessel, wall: Wall, neighbors: Neighbors, exits: Outlets, first_exit: int,
-        kernel: WendlandC2, spacing: float, tool: Tool,
+        self, blood: BloodFlow, vessel: Vessel, outlets: Outlets, first_outlet: int,
+        kernel: WendlandC2, spacing: float,
     ):  # fmt: skip
-        """`first_exit` and the MOST_WOUNDS - 1 after it are the wounds'; `spacing` [m] of blood."""
+        """None at first.
+
+        Args:
+            blood: flows in the vessel.
+            vessel: whose wall it is.
+            outlets: blood leaves by them.
+            first_outlet: it and the MOST_WOUNDS - 1 after it are the wounds'.
+            kernel: of the blood.
+            spacing: of the blood [m].
+        """
+        self.blood = blood
         self.vessel = vessel
-        self.wall = wall
-        self.neighbors = neighbors
-        self.exits = exits
-        self.first_exit = first_exit
+        self.outlets = outlets
+        self.first_outlet = first_outlet
         self.kernel = kernel
         self.spacing = spacing
-        self.tool = tool
-        self.wounds: list[Wound] = []
-        self.suction_rate = 0.0
-        """[m^3/s]"""
-        self.suction_radius = 2.0 * spacing
-        """[m]"""
-        self._owed = 0.0
-        self._sucked_until = 0.0
-        self._intact = wall.given
-        tool.place(wall, neighbors)
+        self._wounds: list[Wound] = []
+        self._intact = blood.wall.given
 
-    def wound(self, centre: Floats, radius: float, end: Floats | None = None) -> Wound:
+    def __len__(self) -> int:
+        """Number of wounds, closed ones too."""
+        return len(self._wounds)
+
+    def __iter__(self) -> Iterator[Wound]:
+        """All wounds, closed ones too."""
+        return iter(self._wounds)
+
+    def open(self, centre: Floats, radius: float, end: Floats | None = None) -> Wound:
         """Open the wall.
 
         Args:
@@ -115,7 +123,7 @@ class Surgery:
         Raises:
             InputError: not at the wall, too small to bleed, or one wound too many.
         """
-        if len(self.wounds) >= MOST_WOUNDS:
+        if len(self._wounds) >= MOST_WOUNDS:
             raise InputError(f"wound: a session has at most {MOST_WOUNDS}")
         least = LEAST_RADIUS * self.spacing
         low, high = self.vessel.bounds
@@ -141,12 +149,13 @@ class Surgery:
         normal = normals.sum(axis=0)
         normal -= line * float(normal @ line) / max(float(line @ line), 1e-20)
         wound = Wound(places[0], places[1], normal / np.linalg.norm(normal), radius)
-        self._fit(wound)
-        self.wounds.append(wound)
-        self._cut(len(self.wounds) - 1)
+        self._choose_outflow_plane(wound)
+        self._wounds.append(wound)
+        self._open_outlet(len(self._wounds) - 1)
+        self._make_wall()
         return wound
 
-    def _fit(self, wound: Wound) -> None:
+    def _choose_outflow_plane(self, wound: Wound) -> None:
         """Choose where blood has left by a wound: outside, and nowhere that the lumen is too.
 
         Raises:
@@ -155,9 +164,9 @@ class Surgery:
         d = self.spacing
         first, second = plane_axes(wound.normal)
         line = wound.end - wound.begin
-        widest = wound.radius + ASIDE * d
-        # Where the wall pulses, outside is beyond its widest.
-        outside = self.wall.most_swing + OUTSIDE * d
+        widest = wound.radius + RIM_CLEARANCE * d
+        # Where the wall moves, outside is beyond its widest.
+        outside = self.blood.wall.largest_amplitude + OUTSIDE * d
         for lift in (outside, outside + 0.5 * d, outside + d):
             across = np.arange(-widest, widest + 0.5 * d, 0.5 * d)
             up = np.arange(lift, widest, 0.5 * d)
@@ -176,163 +185,112 @@ class Surgery:
             "would not get out; choose another place"
         )
 
-    def _cut(self, number: int) -> None:
-        """Let blood leave by a wound, and make the wall anew."""
-        wound = self.wounds[number]
+    def _open_outlet(self, number: int) -> None:
+        """Let blood leave by a wound."""
+        wound = self._wounds[number]
         lift = wound.lift * wound.normal
-        self.exits.open(
-            self.first_exit + number, wound.begin + lift, wound.end + lift, wound.normal,
+        self.outlets.open(
+            self.first_outlet + number, wound.begin + lift, wound.end + lift, wound.normal,
             wound.reach, track_droplets=True,
         )  # fmt: skip
-        self._make_wall()
 
-    def clamp(self, number: int, particles: Particles, time: float) -> None:
-        """Close a wound; blood that is in the hole at this time [s] has left by it.
+    def close(self, number: int | None = None) -> None:
+        """Close a wound, or all; blood that is in the hole has left by it.
 
         Raises:
             InputError: there is no such wound.
         """
-        if not 0 <= number < len(self.wounds):
-            has = f"0 to {len(self.wounds) - 1}" if self.wounds else "none yet"
+        count = len(self._wounds)
+        if number is not None and not 0 <= number < count:
+            has = f"0 to {count - 1}" if count else "none yet"
             raise InputError(f"clamp: there is no wound {number}; there are {has}")
-        wound, k = self.wounds[number], self.first_exit + number
-        if not wound.is_open:
-            return
-        self.exits.mark(particles, self.neighbors.grid, time)
-        self.exits.shut(k)
+        for k in range(count) if number is None else [number]:
+            if self._wounds[k].is_open:
+                self._close(self._wounds[k], self.first_outlet + k)
+        # Also where all were closed before: a replay of the command then sums in the same order.
+        self.blood.neighbors.stale = True
+
+    def _close(self, wound: Wound, k: int) -> None:
+        """Close an open wound, which is outlet k."""
+        particles, wall = self.blood.particles, self.blood.wall
+        self.outlets.mark_outflow()
+        self.outlets.close(k)
         intact = self._intact
         comes_back = self._hole(wound)
         wound.is_open = False
-        for other in self.wounds:
+        for other in self._wounds:
             if other.is_open:
                 comes_back &= ~self._hole(other)
         if comes_back.any():
             live = particles.position.to_numpy()[: particles.count[None]].astype(float)
-            feet = intact.at(self.wall.level) - self.wall.setback * intact.normal
+            feet = intact.at(wall.displacement_factor) - wall.setback * intact.normal
             away, nearest = cKDTree(feet).query(live)
             height = ((live - feet[nearest]) * intact.normal[nearest]).sum(axis=1)
             # Blood before wall that stayed is seated as it is.
-            under = comes_back[nearest] & (height > -SEATED * self.spacing)
-            self.exits.take(particles, under & (away < ASIDE * self.spacing), k)
+            under = comes_back[nearest] & (height > -SEATED_DISTANCE * self.spacing)
+            self.outlets.remove_rows(under & (away < RIM_CLEARANCE * self.spacing), k)
         self._make_wall()
 
     def _hole(self, wound: Wound) -> Booleans:
         """Which proxies of the whole wall a wound takes away, (m,)."""
-        position, normal = self._intact.position, self._intact.normal
-        away = wound.distance(position - self.wall.setback * normal)
+        wall, position, normal = self.blood.wall, self._intact.position, self._intact.normal
+        away = wound.distance(position - wall.setback * normal)
         # Each proxy is the wall for half a spacing round it; across a thin vessel they stay.
-        hole = away < wound.radius + 0.5 * self.wall.spacing
+        hole = away < wound.radius + 0.5 * wall.spacing
         return np.asarray(hole & (normal @ wound.normal > 0.0))
 
     def _make_wall(self) -> None:
         """The wall without the proxies of open wounds (paper, Eq. 3: the rim's volumes anew)."""
-        whole = self._intact
-        position, swing = whole.position, self.wall.most_swing
+        whole, wall = self._intact, self.blood.wall
+        position, amplitude = whole.position, wall.largest_amplitude
         if len(position) == 0:
             return
         gone = np.zeros(len(position), bool)
-        for wound in self.wounds:
+        for wound in self._wounds:
             if wound.is_open:
                 gone |= self._hole(wound)
         near = np.zeros(len(position), bool)
         if gone.any():
-            reach = self.kernel.support_radius + 2.0 * swing
+            reach = self.kernel.support_radius + 2.0 * amplitude
             near = cKDTree(position[gone]).query(position)[0] < reach
         left = Proxies(*(rows[~gone] for rows in whole))
         near = near[~gone]
         volume = wide_volume = refreshed_volumes(left.position, left.volume, self.kernel, near)
-        if swing:
+        if amplitude:
             wide_volume = refreshed_volumes(left.at(1.0), left.wide_volume, self.kernel, near)
-        self.wall.given = left._replace(volume=volume, wide_volume=wide_volume)
-        self.neighbors.sort_wall(self.wall)
+        wall.given = left._replace(volume=volume, wide_volume=wide_volume)
+        self.blood.neighbors.sort_wall(wall)
 
-    def compile_kernels(self, particles: Particles) -> None:
-        """Have the kernel of the suction compiled."""
-        suck(particles, self.exits, 0.0, 0.0, 0.0, 0.0, 0)
-
-    def before_build(self, particles: Particles, time: float) -> None:
-        """Mark the blood that suction takes until a time [s]."""
-        if self.suction_rate > 0.0:
-            self._owed += self.suction_rate * (time - self._sucked_until) / self.spacing**3
-            taken = 0
-            if self._owed >= 1.0:
-                tip = map(float, self.tool.position)
-                taken = suck(particles, self.exits, *tip, self.suction_radius, int(self._owed))
-            # What is not there to be taken is not owed.
-            self._owed = min(self._owed - taken, 1.0)
-        self._sucked_until = time
-
-    def before_drift(self, dt: float) -> float:
-        """Move the tool by a step of dt [s]; returns how far the lists have to reach for it [m]."""
-        if self.tool.settled:
-            return 0.0
-        if self.tool.shape is None:
-            way = self.tool.jump()
-            # Suction takes blood when the lists are built.
-            return way if self.suction_rate > 0.0 else 0.0
-        moved = not self.tool.at_rest
-        self.tool.aim()
-        if self.tool.at_rest and not moved:
-            return 0.0
-        way = self.tool.move(dt)
-        self.tool.place(self.wall, self.neighbors)
-        return way
-
-    def start_again(self, time: float) -> None:
-        """As at the start, at a time [s]."""
-        tool, had = self.tool, len(self.wounds)
-        self.wounds = []
-        self.exits.drop_count[None] = 0
+    def reset(self) -> None:
+        """No wound has ever been."""
+        had = len(self._wounds)
+        self._wounds = []
         for number in range(had):
-            self.exits.shut(self.first_exit + number)
+            self.outlets.close(self.first_outlet + number)
         if had:
             self._make_wall()
-        self.suction_rate, self._owed, self._sucked_until = 0.0, 0.0, time
-        tool.start_again()
-        tool.place(self.wall, self.neighbors)
 
-    def state(self) -> dict[str, Any]:
-        """All of it as numbers, lists and names."""
-        tool = self.tool
+    def save_state(self) -> dict[str, Any]:
+        """A row of numbers for each wound."""
         return {
             "wounds": [
                 [*map(float, (*w.begin, *w.end, *w.normal, w.radius, w.lift, w.reach)), w.is_open]
-                for w in self.wounds
-            ],
-            "suction": [self.suction_rate, self.suction_radius, self._owed, self._sucked_until],
-            "tool": [
-                [float(x) for x in value]
-                for value in (
-                    tool.position, tool.rotation.as_quat(), tool.wanted_position,
-                    tool.wanted_rotation.as_quat(), tool.velocity, tool.spin,
-                )
-            ],
-        }  # fmt: skip
+                for w in self._wounds
+            ]
+        }
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
-        self.wounds = [
+    def load_state(self, saved: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._wounds = [
             Wound(
-                np.array(row[0:3]),
-                np.array(row[3:6]),
-                np.array(row[6:9]),
-                radius=row[9],
-                lift=row[10],
-                reach=row[11],
-                is_open=bool(row[12]),
+                np.array(row[0:3]), np.array(row[3:6]), np.array(row[6:9]), radius=row[9],
+                lift=row[10], reach=row[11], is_open=bool(row[12]),
             )
-            for row in state["wounds"]
-        ]
+            for row in saved["wounds"]
+        ]  # fmt: skip
         for number in range(MOST_WOUNDS):
-            self.exits.shut(self.first_exit + number)
-        for number, wound in enumerate(self.wounds):
+            self.outlets.close(self.first_outlet + number)
+        for number, wound in enumerate(self._wounds):
             if wound.is_open:
-                self._cut(number)
+                self._open_outlet(number)
         self._make_wall()
-        self.suction_rate, self.suction_radius, self._owed, self._sucked_until = state["suction"]
-        tool, rows = self.tool, [np.array(row) for row in state["tool"]]
-        tool.position, tool.wanted_position, tool.velocity, tool.spin = (
-            rows[0], rows[2], rows[4], rows[5]
-        )  # fmt: skip
-        tool.rotation, tool.wanted_rotation = map(Rotation.from_quat, (rows[1], rows[3]))
-        tool.place(self.wall, self.neighbors)

@@ -17,7 +17,7 @@ from builders import (
 from reference import separations
 from taichi_sph.errors import RunError
 from taichi_sph.fluid.rheology import Casson, Newtonian
-from taichi_sph.motion import Motion
+from taichi_sph.simulation import Simulation
 
 GRAVITY = (0.0, 0.0, -9.81)
 SOUND = 1.5
@@ -37,27 +37,27 @@ def pool(seed: int = 0, speed: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
     return x, speed * np.random.default_rng(seed).normal(size=x.shape)
 
 
-def stirred(seed: int = 0, rows: np.ndarray | None = None, **options) -> Motion:
+def stirred(seed: int = 0, rows: np.ndarray | None = None, **options) -> Simulation:
     x, v = pool(seed)
     rows = np.arange(len(x)) if rows is None else rows
     stage = plane()
     stage.put(x[rows], v[rows], rows)
-    return stage.motion(make_model(BLOOD), GRAVITY, SOUND, **options)
+    return stage.simulation(make_model(BLOOD), GRAVITY, SOUND, **options)
 
 
-def state(motion: Motion) -> list[np.ndarray]:
-    p = motion.particles
+def state(sim: Simulation) -> list[np.ndarray]:
+    p = sim.particles
     return [p.in_order(f) for f in (p.position, p.velocity, p.acceleration, p.density)]
 
 
 def test_two_runs_agree_bitwise():
     runs, steps, builds = [], [], []
     for _ in range(2):
-        motion = stirred()
-        motion.advance_to(0.02)
-        runs.append(state(motion))
-        steps.append(motion.steps)
-        builds.append(motion.neighbors.builds)
+        sim = stirred()
+        sim.advance_to(0.02)
+        runs.append(state(sim))
+        steps.append(sim.steps)
+        builds.append(sim.neighbors.builds)
     # More than one list was used, or sorting was not put to the test.
     assert builds[1] - builds[0] > 3
     assert steps[0] == steps[1] > 50
@@ -76,56 +76,56 @@ def test_a_run_does_not_depend_on_the_rows_that_particles_began_in():
 
 
 def test_advancing_lands_on_the_time_in_equal_steps():
-    motion = stirred()
+    sim = stirred()
     frame = 1.0 / 300.0
     for k in range(1, 4):
-        steps = motion.steps
-        motion.advance_to(k * frame)
-        assert motion.time == k * frame
+        steps = sim.steps
+        sim.advance_to(k * frame)
+        assert sim.time == k * frame
         # The last step is as long as the mean one: no sliver at the end of a frame.
-        assert motion.last_step == pytest.approx(frame / (motion.steps - steps), rel=0.1)
+        assert sim.last_step == pytest.approx(frame / (sim.steps - steps), rel=0.1)
 
 
 def test_a_step_is_never_longer_than_what_remains_nor_than_its_limits():
-    motion = stirred()
-    motion.step(1e-7)
-    assert motion.last_step == 1e-7
-    motion.step_limit = 3e-6
-    motion.step(1.0)
-    assert motion.last_step == pytest.approx(3e-6, rel=1e-5)
-    assert motion.last_step <= 3e-6
-    motion.step_limit = np.inf
-    motion.step(1.0)
-    assert motion.last_step == pytest.approx(0.4 * 0.5 * R / SOUND, rel=0.3)
+    sim = stirred()
+    sim.step(1e-7)
+    assert sim.last_step == 1e-7
+    sim.step_limit = 3e-6
+    sim.step(1.0)
+    assert sim.last_step == pytest.approx(3e-6, rel=1e-5)
+    assert sim.last_step <= 3e-6
+    sim.step_limit = np.inf
+    sim.step(1.0)
+    assert sim.last_step == pytest.approx(0.4 * 0.5 * R / SOUND, rel=0.3)
 
 
 def test_advancing_to_the_present_takes_no_step():
-    motion = stirred()
-    motion.advance_to(1e-3)
-    steps = motion.steps
-    motion.advance_to(1e-3)
-    assert motion.steps == steps
+    sim = stirred()
+    sim.advance_to(1e-3)
+    steps = sim.steps
+    sim.advance_to(1e-3)
+    assert sim.steps == steps
 
 
-def test_a_motion_without_blood_reaches_its_time():
+def test_a_simulation_without_blood_reaches_its_time():
     stage = plane()
     stage.put(np.zeros((0, 3)))
-    motion = stage.motion(make_model(BLOOD), GRAVITY)
-    motion.advance_to(0.5)
-    assert (motion.time, motion.steps) == (0.5, 0)
+    sim = stage.simulation(make_model(BLOOD), GRAVITY)
+    sim.advance_to(0.5)
+    assert (sim.time, sim.steps) == (0.5, 0)
 
 
 def test_lists_are_good_for_every_step_of_a_run():
-    motion = stirred()
+    sim = stirred()
     count = 8 * 8 * 6
     drifted = 0.0
     for k in range(60):
-        motion.step(1.0)
-        if motion._stale or k % 3:
+        sim.step(1.0)
+        if sim.neighbors.stale or k % 3:
             continue
-        n, nb = motion.particles.count[None], motion.neighbors
+        n, nb = sim.particles.count[None], sim.neighbors
         assert n == count
-        x = motion.particles.position.to_numpy()[:n].astype(float)
+        x = sim.particles.position.to_numpy()[:n].astype(float)
         built = np.stack([f.to_numpy()[:n] for f in (nb.built.x, nb.built.y, nb.built.z)], -1)
         distance = np.linalg.norm(separations(x, x, plane().period), axis=-1)
         np.fill_diagonal(distance, np.inf)
@@ -142,19 +142,19 @@ def test_lists_are_good_for_every_step_of_a_run():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_state_that_is_not_finite_ends_the_run_and_names_particle_and_time(value):
-    motion = stirred()
-    motion.advance_to(1e-3)
-    steps = motion.steps
-    velocity = motion.particles.velocity.to_numpy()
-    row = int(np.flatnonzero(motion.particles.identity.to_numpy()[:384] == 123)[0])
+    sim = stirred()
+    sim.advance_to(1e-3)
+    steps = sim.steps
+    velocity = sim.particles.velocity.to_numpy()
+    row = int(np.flatnonzero(sim.particles.identity.to_numpy()[:384] == 123)[0])
     velocity[row, 1] = value
     # Physics would spoil its neighbours as well: here it alone is broken.
-    names = motion.particles.identity.to_numpy()
-    motion.particles.velocity.from_numpy(velocity)
-    motion.model = Prescribed(np.zeros_like, 1e-4)
+    names = sim.particles.identity.to_numpy()
+    sim.particles.velocity.from_numpy(velocity)
+    sim.model = Prescribed(np.zeros_like, 1e-4)
     with pytest.raises(RunError) as error:
-        motion.step(1.0)
-    x = ", ".join(f"{c:.4g}" for c in motion.particles.position.to_numpy()[row])
+        sim.step(1.0)
+    x = ", ".join(f"{c:.4g}" for c in sim.particles.position.to_numpy()[row])
     assert names[row] == 123
     assert str(error.value) == (
         f"the run diverged: particle 123 is not finite (1 in all) at t = 0.001 s, step {steps}, "
@@ -169,7 +169,7 @@ def test_a_broken_particle_is_found_with_the_physics_too():
     stage = plane()
     stage.put(x, v)
     with pytest.raises(RunError, match=r"is not finite \(\d+ in all\) at t = 0 s, step 0"):
-        stage.motion(make_model(BLOOD), GRAVITY, SOUND).step(1.0)
+        stage.simulation(make_model(BLOOD), GRAVITY, SOUND).step(1.0)
 
 
 def test_an_acceleration_that_is_not_finite_ends_the_run():
@@ -181,9 +181,9 @@ def test_an_acceleration_that_is_not_finite_ends_the_run():
         a[17] = np.nan
         return a
 
-    motion = stage.motion(Prescribed(law, 1e-4))
+    sim = stage.simulation(Prescribed(law, 1e-4))
     with pytest.raises(RunError, match=r"particle \d+ is not finite \(1 in all\) at t = 0 s"):
-        motion.step(1.0)
+        sim.step(1.0)
 
 
 def test_blood_that_is_too_fast_ends_the_run_and_names_particle_and_limit():
@@ -191,9 +191,9 @@ def test_blood_that_is_too_fast_ends_the_run_and_names_particle_and_limit():
     v[37] = [0.0, 2.0, 0.0]
     stage = plane()
     stage.put(x, v)
-    motion = stage.motion(make_model(BLOOD), GRAVITY, SOUND)
+    sim = stage.simulation(make_model(BLOOD), GRAVITY, SOUND)
     with pytest.raises(RunError) as error:
-        motion.step(1.0)
+        sim.step(1.0)
     assert re.match(
         r"the run diverged: particle 37 moves at 2 m/s, above the limit of 1\.5 m/s, "
         r"at t = 0 s, step 0, near \(0\.0005, 0\.0065, 0\.0015\) m; likely cause: the sound",
@@ -213,14 +213,14 @@ def test_the_likely_cause_is_told_apart(integrator, neighbours, cause):
     stage = plane()
     x = cubic_lattice(4, 4, 4) if neighbours else np.array([[4.0, 4.0, 8.0]]) * D
     stage.put(x, np.tile([5.0, 0.0, 0.0], (len(x), 1)))
-    motion = stage.motion(Prescribed(np.zeros_like, 1e-4), speed_limit=1.0, integrator=integrator)
+    sim = stage.simulation(Prescribed(np.zeros_like, 1e-4), speed_limit=1.0, integrator=integrator)
     with pytest.raises(RunError, match=re.escape(f"likely cause: {cause}")):
-        motion.step(1.0)
+        sim.step(1.0)
 
 
-def energy(motion: Motion) -> float:
+def energy(sim: Simulation) -> float:
     """Kinetic and internal energy by brute force, above that of the lattice [J]."""
-    p = motion.particles
+    p = sim.particles
     blood = periodic().reference(INVISCID)
     assert len(blood.x) == p.count[None]
     return blood.kinetic_energy() + blood.internal_energy()
@@ -234,13 +234,13 @@ def ring(integrator: str, steps: int) -> np.ndarray:
     lattice = stage.reference(INVISCID).internal_energy()
     v = 0.02 * np.random.default_rng(3).normal(size=x.shape)
     stage.put(x, v)
-    motion = stage.motion(make_model(INVISCID), speed_limit=SOUND, integrator=integrator)
-    motion.step_limit = 0.1 * D / SOUND
-    energies = [energy(motion) - lattice]
+    sim = stage.simulation(make_model(INVISCID), speed_limit=SOUND, integrator=integrator)
+    sim.step_limit = 0.1 * D / SOUND
+    energies = [energy(sim) - lattice]
     for _ in range(5):
         for _ in range(steps // 5):
-            motion.step(1e3)
-        energies.append(energy(motion) - lattice)
+            sim.step(1e3)
+        energies.append(energy(sim) - lattice)
     return np.array(energies) / energies[0]
 
 
@@ -260,12 +260,12 @@ def test_wall_carries_the_weight_of_blood_at_rest_on_it():
     x = cubic_lattice(8, 8, 6)
     stage = plane()
     stage.put(x)
-    motion = stage.motion(make_model(BLOOD), GRAVITY, SOUND)
-    motion.advance_to(0.1)
+    sim = stage.simulation(make_model(BLOOD), GRAVITY, SOUND)
+    sim.advance_to(0.1)
     lift = []
     for k in range(1, 21):
-        motion.advance_to(0.1 + 0.005 * k)
+        sim.advance_to(0.1 + 0.005 * k)
         # Forces between particles cancel: what is left of the mean is the wall's and gravity.
         lift.append(stage.in_order(stage.particles.acceleration)[:, 2].mean() + 9.81)
     assert np.mean(lift) == pytest.approx(9.81, rel=WEIGHT)
-    assert motion.wall_corrections == 0
+    assert sim.wall_corrections == 0

@@ -1,0 +1,264 @@
+"""Assembly: the parts of a simulation from a scene and its vessel."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.flow_extension import buffer_sites, flow_extension
+from taichi_sph.boundary.inflow import (
+    HYSTERESIS,
+    BufferZones,
+    DrivenOpening,
+    buffer_blood,
+    buffer_capacity,
+    buffer_layers,
+    buffer_regions,
+)
+from taichi_sph.boundary.outlets import Outlets
+from taichi_sph.boundary.suction import Suction
+from taichi_sph.boundary.tool import Tool
+from taichi_sph.boundary.tool_surface import ToolSurface, read_tool_surface
+from taichi_sph.boundary.wall_motion import MovingWall, WallMotion, read_wall_motion
+from taichi_sph.boundary.wounds import MOST_WOUNDS, Wounds
+from taichi_sph.derived import Derived, derive
+from taichi_sph.errors import InputError
+from taichi_sph.fluid.calibration import Calibration, calibrate
+from taichi_sph.fluid.equation_of_state import Tait
+from taichi_sph.fluid.rheology import make_rheology
+from taichi_sph.fluid.wcsph import Fluid
+from taichi_sph.geometry.mesh import Floats
+from taichi_sph.geometry.vessel import Vessel
+from taichi_sph.particles.grid import cells_within, make_grid
+from taichi_sph.particles.neighbors import Neighbors
+from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.smoothing_kernel import WendlandC2
+from taichi_sph.particles.wall import Wall
+from taichi_sph.scene import Scene
+from taichi_sph.waveform import read_waveform
+
+SKIN = 0.1
+"""Skin of the neighbour lists over the support radius: a wider one is built less often and holds
+more candidates; from 0.12 on (2.24 d) it holds the lattice's next shell.  Of 0.02 to 0.3, PcNet
+runs A fastest with 0.1 and the physics, whose steps are short, is 7 % faster with 0.05 to 0.08."""
+
+OPENING_REACH = 2.5
+"""Blood beyond an opening's plane has left by it within this many radii of its centre."""
+
+PACKING = 1.1
+"""Blood that flows in may pack the vessel closer than the lattice at the start by this factor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """What a simulation of a scene is made of."""
+
+    scene: Scene
+    vessel: Vessel
+    derived: Derived
+    fluid: Fluid
+    initial_blood: Floats
+    """Positions at the start [m], (n, 3)."""
+    blood: BloodFlow
+    boundaries: tuple[Boundary, ...]
+    """In the order in which they are asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What a scene's parts are made from, before there are any fields."""
+
+    scene: Scene
+    vessel: Vessel
+    kernel: WendlandC2
+    calibration: Calibration
+    motion: WallMotion | None
+    driven: list[DrivenOpening]
+    tool: ToolSurface | None
+    tool_position: Floats
+    """[m]"""
+
+    @property
+    def spacing(self) -> float:
+        """Of the blood [m]."""
+        return self.scene.discretization.spacing
+
+    @property
+    def wall_spacing(self) -> float:
+        """Of the proxies [m]."""
+        return self.scene.discretization.wall_spacing_ratio * self.spacing
+
+    @property
+    def layers(self) -> int:
+        """Layers of a buffer."""
+        return buffer_layers(self.spacing, self.kernel.support_radius)
+
+    @property
+    def buffer_depth(self) -> float:
+        """Length of the flow extensions [m]."""
+        return buffer_regions(self.driven, self.spacing, self.kernel.support_radius).depth
+
+
+def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
+    """Sample the wall, fill the column and make all fields but those of a model.
+
+    Raises:
+        InputError: the column does not fit the vessel, or something that the scene names cannot be
+            used.
+    """
+    plan = _make_plan(scene, vessel)
+    proxies = _sample_proxies(plan, seed)
+    initial = _fill(plan)
+    derived = derive(scene, vessel, len(initial), len(proxies[0]))
+    fluid = _make_fluid(plan, derived)
+    particles = Particles.from_numpy(
+        initial, mass=scene.blood.density * plan.spacing**3, room=_room(plan, len(initial))
+    )
+    position, normal, amplitude = proxies
+    wall = Wall.from_numpy(
+        position, normal, plan.kernel, plan.calibration.setback, plan.wall_spacing,
+        tool=0 if plan.tool is None else len(plan.tool.position), amplitude=amplitude,
+    )  # fmt: skip
+    neighbors = _make_neighbors(plan, particles.capacity, wall)
+    blood = BloodFlow(particles, wall, neighbors, scene.gravity)
+    return Assembly(scene, vessel, derived, fluid, initial, blood, _make_boundaries(plan, blood))
+
+
+def _make_plan(scene: Scene, vessel: Vessel) -> _Plan:
+    discretization = scene.discretization
+    spacing = discretization.spacing
+    kernel = WendlandC2(discretization.support_ratio * spacing)
+    wall_spacing = discretization.wall_spacing_ratio * spacing
+    calibration = calibrate(kernel, spacing, wall_spacing, scene.blood.density)
+    driven = make_driven_openings(scene, vessel)
+    motion = read_wall_motion(scene, vessel)
+    if scene.tool is None:
+        # A mere tip, just inside the column's opening.
+        opening = vessel.opening(scene.column.opening)
+        surface, position = None, opening.centre - opening.radius * opening.normal
+    else:
+        surface = read_tool_surface(
+            scene.tool, Path(scene.folder), wall_spacing, calibration.setback, kernel
+        )
+        position = np.array(scene.tool.position)
+    return _Plan(scene, vessel, kernel, calibration, motion, driven, surface, position)
+
+
+def make_driven_openings(scene: Scene, vessel: Vessel) -> list[DrivenOpening]:
+    """What drives the openings of a scene.
+
+    Raises:
+        InputError: a waveform that cannot be read, an opening too narrow for one particle.
+    """
+    driven = []
+    for k, opening in enumerate(vessel.openings):
+        table = scene.openings[opening.name]
+        if table.driven:
+            sites = buffer_sites(vessel.rim(k), opening, scene.discretization.spacing)
+            if len(sites) == 0:
+                raise InputError(
+                    f"openings.{opening.name}: too narrow to be driven at spacing "
+                    f"{scene.discretization.spacing:g} m"
+                )
+            waveform = read_waveform(table.waveform, Path(scene.folder))
+            driven.append(DrivenOpening(opening, table.flow, table.pressure, waveform, sites))
+    return driven
+
+
+def _sample_proxies(plan: _Plan, seed: int) -> tuple[Floats, Floats, Floats]:
+    """Proxies of wall and flow extensions: positions, normals, amplitudes, (m, 3), (m, 3), (m,)."""
+    vessel, setback = plan.vessel, plan.calibration.setback
+    sample = vessel.sample_wall(plan.wall_spacing, setback, seed)
+    positions, normals = [sample.positions], [sample.normals]
+    amplitudes = [np.zeros(len(sample.positions))]
+    if plan.motion is not None:
+        feet = sample.positions - setback * sample.normals
+        amplitudes = [plan.motion.amplitude_at(vessel, feet)]
+    for driven in plan.driven:
+        rim = vessel.rim(vessel.openings.index(driven.opening))
+        position, normal = flow_extension(
+            rim, driven.opening, plan.wall_spacing, setback, plan.buffer_depth
+        )
+        positions.append(position)
+        normals.append(normal)
+        amplitudes.append(np.zeros(len(position)))
+    return np.concatenate(positions), np.concatenate(normals), np.concatenate(amplitudes)
+
+
+def _fill(plan: _Plan) -> Floats:
+    """Blood at the start (n, 3) [m]: the column, where the tool leaves it room, and the buffers."""
+    column = plan.vessel.fill_column(plan.scene.column, plan.spacing)
+    if plan.tool is not None and len(column):
+        apart = column - plan.tool_position
+        clear = plan.tool.distance(apart) > 0.5 * plan.spacing
+        column = column[clear & plan.tool.outside(apart)]
+    buffers = buffer_blood(plan.driven, column, plan.spacing, plan.layers)
+    return np.concatenate([column, buffers])
+
+
+def _room(plan: _Plan, count: int) -> int:
+    """Rows for blood that flows in: it may fill the vessel at its widest, and pack it closer."""
+    if not plan.driven:
+        return 0
+    widest = plan.vessel.volume
+    if plan.motion is not None:
+        widest += plan.vessel.wall_area * plan.motion.amplitude
+    full = widest / plan.spacing**3 + buffer_capacity(plan.driven, plan.layers)
+    return max(0, math.ceil(PACKING * full) - count)
+
+
+def _make_fluid(plan: _Plan, derived: Derived) -> Fluid:
+    scene = plan.scene
+    return Fluid(
+        kernel=plan.kernel,
+        equation_of_state=Tait(scene.blood.density, derived.sound_speed),
+        rheology=make_rheology(scene.blood.rheology),
+        calibration=plan.calibration,
+        artificial_viscosity=scene.blood.artificial_viscosity,
+        courant_number=scene.discretization.courant_number,
+        nested=scene.discretization.viscous_form == "nested",
+    )
+
+
+def _make_neighbors(plan: _Plan, capacity: int, wall: Wall) -> Neighbors:
+    """Lists over the cells that blood can be in."""
+    radius, vessel = plan.kernel.support_radius, plan.vessel
+    skin = SKIN * radius
+    # The wall's proxies, and blood that leaves through an opening, are within this.
+    margin = 2.0 * (radius + skin) + wall.largest_amplitude
+    margin += plan.buffer_depth if plan.driven else 0.0
+    lower, upper = vessel.vertices.min(axis=0) - margin, vessel.vertices.max(axis=0) + margin
+    grid = make_grid(lower, upper, radius + skin + 0.5 * wall.largest_amplitude)
+    used = cells_within(grid, vessel.signed_distance, margin)
+    return Neighbors.allocate(grid, radius, skin, capacity, plan.spacing, wall, used)
+
+
+def _make_boundaries(plan: _Plan, blood: BloodFlow) -> tuple[Boundary, ...]:
+    """All boundaries of a scene, in the order in which they are asked.
+
+    What has left is marked first, so that suction finds only what is still there, and blood that is
+    added is not taken before it has moved.  Suction asks how far the tool has moved, after it has.
+    """
+    scene, vessel, spacing = plan.scene, plan.vessel, plan.spacing
+    outlets = Outlets(blood, len(vessel.openings) + MOST_WOUNDS)
+    far_end = (plan.layers + HYSTERESIS) * spacing
+    for k, opening in enumerate(vessel.openings):
+        if opening.is_open:
+            beyond = (far_end if scene.openings[opening.name].driven else 0.0) * opening.normal
+            end = opening.centre + beyond
+            outlets.open(k, end, end, opening.normal, OPENING_REACH * opening.radius)
+    tool = Tool(blood, plan.tool, plan.tool_position)
+    boundaries: list[Boundary] = [
+        outlets,
+        tool,
+        Suction(blood, outlets, tool, spacing),
+        BufferZones(
+            blood, plan.driven, spacing, plan.kernel.support_radius, scene.blood.density
+        ),
+        Wounds(blood, vessel, outlets, len(vessel.openings), plan.kernel, spacing),
+    ]  # fmt: skip
+    if plan.motion is not None:
+        boundaries.append(MovingWall(blood, plan.motion))
+    return tuple(boundaries)

@@ -1,0 +1,77 @@
+"""The boundary protocol: what moves the wall, brings blood in or takes it out.
+
+`Simulation` asks each of its boundaries, in their order, at fixed moments:
+
+    moment             when                                        what a boundary may do there
+    before_lists       the neighbour lists are about to be built   add particles, mark some removed
+    before_drift       every step, after the accelerations         move buffers, tool and wall
+    reset              blood has been replaced, the clock is set   be as at the start
+    save_state         between two steps                           nothing
+    load_state         blood and clock are back, lists are stale   put itself and its wall back
+    compile_kernels    before a session                            launch what changes nothing
+
+A step is  (before_lists, build lists, if they are stale) -> accelerate -> before_drift -> drift.
+What a user does to a boundary between two steps (its other methods) may change the wall and the
+blood at once, and then leaves the lists stale.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+from taichi_sph.fluid.wcsph import AccelerationModel
+from taichi_sph.particles.neighbors import Neighbors
+from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.wall import Wall
+
+
+@dataclass(eq=False)
+class BloodFlow:
+    """Blood, the wall about it and the lists between them, at a time: what boundaries act upon."""
+
+    particles: Particles
+    wall: Wall
+    neighbors: Neighbors
+    gravity: tuple[float, float, float]
+    """Body force per mass g [m/s^2]."""
+    time: float = 0.0
+    """Simulated time [s]."""
+
+    def __post_init__(self) -> None:
+        """Bring the wall into the order of the lists."""
+        self.neighbors.sort_wall(self.wall)
+
+
+class Boundary(ABC):
+    """One thing that moves the wall, brings blood in or takes it out."""
+
+    name: str
+    """Key of its part of a saved state."""
+
+    def before_lists(self) -> None:
+        """Add particles, and mark those that are to be removed with a negative identity."""
+        return
+
+    def before_drift(self, dt: float, model: AccelerationModel) -> float:
+        """Move what moves by a step of dt [s], under the accelerations that `model` has written.
+
+        Returns:
+            how far a proxy, or a place that blood is looked up at, may have moved [m].
+        """
+        return 0.0
+
+    def compile_kernels(self, model: AccelerationModel) -> None:
+        """Launch the kernels that a user would otherwise wait for; nothing changes."""
+        return
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Be as at the start, at the time that the flow has."""
+
+    @abstractmethod
+    def save_state(self) -> dict[str, Any]:
+        """All that changes, by name: numbers, names, lists of them, and arrays."""
+
+    @abstractmethod
+    def load_state(self, saved: dict[str, Any]) -> None:
+        """Go on from what `save_state` gave for the same scene."""
