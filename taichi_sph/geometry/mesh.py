@@ -17,25 +17,6 @@ Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 
 
-def clean(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
-    """Merge vertices at the same place; drop collapsed triangles and vertices that none uses."""
-    if len(faces) == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    # STL repeats every corner; single precision is its grain, so compare at that grain.
-    extent = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
-    grain = max(extent, 1e-300) * 1e-7
-    keys = np.round((vertices - vertices.min(axis=0)) / grain).astype(np.int64)
-    _, first, label = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    merged = rank[label.reshape(-1)][faces]
-    vertices = vertices[first[order]]
-    a, b, c = merged.T
-    merged = merged[(a != b) & (b != c) & (c != a)]
-    return drop_unused(vertices, merged)
-
-
 def drop_unused(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Drop vertices that no triangle uses."""
     used = np.zeros(len(vertices), bool)
