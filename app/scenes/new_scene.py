@@ -13,6 +13,7 @@ from app.scenes.scene_folder import publish, readme_text, scene_text
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.caps import BULGE
+from taichi_sph.geometry.mending import largest_piece, mend
 from taichi_sph.geometry.mesh import Floats, Integers
 from taichi_sph.geometry.openings import Ends, close_holes, find_openings
 from taichi_sph.geometry.surface_file import load_surface, require_manifold, where
@@ -24,6 +25,13 @@ from taichi_sph.geometry.vessel import (
     crossings,
 )
 from taichi_sph.scene import OpeningTable
+
+METRES, MILLIMETRES, MICROMETRES = 1.0, 1e-3, 1e-6
+"""Units that are guessed, in metres."""
+LARGEST_RADIUS = 0.05
+"""No opening of a vessel is wider [m]: an aneurysm of the aorta that has to be mended has half."""
+LARGEST_VOLUME = 1e-3
+"""And no lumen holds more [m^3]: the whole aorta holds a quarter of it."""
 
 
 def create_scene(
@@ -52,9 +60,11 @@ def create_scene(
             raise InputError(f"{name}: {value:g} is not a length; allowed: positive numbers")
     vertices, faces = load_surface(path)
     notes: list[str] = []
-    scale = _guess_scale(vertices, scale, path, notes)
-    vertices, faces = _tidy(vertices * scale, faces, str(path), notes)
-    ends = _openings(vertices, faces, str(path), scale, notes)
+    # In units of the file: a speck far away shall not decide what they are.
+    vertices, faces = _tidy(vertices, faces, str(path), notes)
+    given, scale = scale, _guess_scale(vertices, scale, path)
+    ends = _openings(vertices * scale, faces, str(path), scale, notes)
+    notes.insert(0, _describe_units(ends, scale, given, path))
     vertices, faces = ends.vertices, ends.faces
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     vertices = vertices - middle
@@ -83,17 +93,16 @@ def create_scene(
     return "\n".join([f"{folder}: new scene", *(f"  {note}" for note in notes)])
 
 
-def _guess_scale(vertices: Floats, scale: float | None, path: Path, notes: list[str]) -> float:
-    """Metres per unit of the file."""
+def _guess_scale(vertices: Floats, scale: float | None, path: Path) -> float:
+    """Metres per unit of the file.
+
+    Raises:
+        InputError: no unit makes a vessel of it.
+    """
     extent = float(np.ptp(vertices, axis=0).max())
     if scale is None:
-        guesses = {1.0: "metres", 1e-3: "millimetres", 1e-6: "micrometres"}
-        for guess, unit in guesses.items():
+        for guess in (METRES, MILLIMETRES, MICROMETRES):
             if SMALLEST <= extent * guess <= LARGEST:
-                notes.append(
-                    f"units: assumed {unit}, for the surface is {extent:.4g} units across "
-                    f"({1e3 * extent * guess:.4g} mm); --scale sets another"
-                )
                 return guess
         raise InputError(
             f"{path}: {extent:.4g} units across, which is no vessel in metres, millimetres or "
@@ -104,28 +113,59 @@ def _guess_scale(vertices: Floats, scale: float | None, path: Path, notes: list[
             f"--scale: {scale:g} makes {path} {extent * scale:.4g} m across; allowed: "
             f"{SMALLEST:g} to {LARGEST:g} m"
         )
-    notes.append(f"units: {scale:g} m per unit, as given ({1e3 * extent * scale:.4g} mm across)")
     return scale
+
+
+def _describe_units(ends: Ends, scale: float, given: float | None, path: Path) -> str:
+    """What is said of the units, once the openings are known.
+
+    Raises:
+        InputError: the units were guessed, and no vessel is so large.
+    """
+    extent = float(np.ptp(ends.vertices, axis=0).max()) / scale
+    radius = max(c.radius for c in ends.found) / scale
+    volume = mesh.enclosed_volume(ends.vertices, ends.faces) / scale**3
+
+    def sizes(unit: float) -> str:
+        return (
+            f"{1e3 * extent * unit:.3g} mm across, opening of radius {1e3 * radius * unit:.3g} mm, "
+            f"{1e6 * volume * unit**3:.3g} ml"
+        )
+
+    def is_vessel(unit: float) -> bool:
+        small = radius * unit <= LARGEST_RADIUS and volume * unit**3 <= LARGEST_VOLUME
+        return small and SMALLEST <= extent * unit <= LARGEST
+
+    if given is not None:
+        return f"units: {scale:g} m per unit, as given ({1e3 * extent * scale:.4g} mm across)"
+    unit = {METRES: "metres", MILLIMETRES: "millimetres", MICROMETRES: "micrometres"}[scale]
+    if not is_vessel(scale):
+        others = {1.0: "metres", 0.01: "centimetres", 0.0254: "inches", 1e-3: "millimetres"}
+        choices = "; ".join(
+            f"{value:g} for {name} ({sizes(value)})"
+            for value, name in others.items()
+            if value != scale
+        )
+        raise InputError(
+            f"{path}: {extent:.4g} units across, which in {unit} is no vessel ({sizes(scale)}); "
+            f"give --scale, in metres per unit: {choices}; or {scale:g} if it is so large"
+        )
+    note = (
+        f"units: assumed {unit}, for the surface is {extent:.4g} units across "
+        f"({1e3 * extent * scale:.4g} mm); --scale sets another"
+    )
+    if scale == MILLIMETRES and is_vessel(0.01):
+        note += f", --scale 0.01 if these are centimetres ({sizes(0.01)})"
+    return note
 
 
 def _tidy(
     vertices: Floats, faces: Integers, label: str, notes: list[str]
 ) -> tuple[Floats, Integers]:
     """One piece, triangles turning alike."""
-    vertices, faces = mesh.clean(vertices, faces)
-    if len(faces) == 0:
-        raise InputError(f"{label}: all triangles have collapsed to lines; a tube is needed")
-    count, piece = mesh.components(faces, len(vertices))
-    if count > 1:
-        area = np.linalg.norm(mesh.face_vectors(vertices, faces), axis=1)
-        share = np.bincount(piece, area) / area.sum()
-        if share.max() < 0.99:
-            raise InputError(
-                f"{label}: {count} separate pieces, the largest with {100 * share.max():.0f} % of "
-                "the area; the lumen must be one connected surface"
-            )
-        vertices, faces = mesh.drop_unused(vertices, faces[piece == share.argmax()])
-        notes.append(f"left out: {count - 1} small loose pieces, {100 * (1 - share.max()):.2g} %")
+    vertices, faces, mended = mend(vertices, faces, label)
+    vertices, faces, left = largest_piece(vertices, faces, label)
+    notes += mended + left
     if not mesh.is_winding_consistent(faces) and (mesh.edge_uses(faces)[2] <= 2).all():
         faces = np.ascontiguousarray(igl.bfs_orient(faces)[0], np.int64)
         notes.append("normals: neighbouring triangles turned different ways; made to agree")

@@ -8,7 +8,8 @@ import numpy as np
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import wall_sampling
-from taichi_sph.geometry.mesh import Booleans, Floats, Integers, NearestPoint, clean, is_closed
+from taichi_sph.geometry.mending import mend
+from taichi_sph.geometry.mesh import Booleans, Floats, Integers, NearestPoint, is_closed
 from taichi_sph.geometry.surface_file import load_surface, require_manifold, require_outward
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import proxy_volumes
@@ -61,8 +62,8 @@ def read_tool_surface(
     """
     path = folder / table.surface
     vertices, faces = load_surface(path)
-    vertices, faces = clean(vertices * table.scale, faces)
-    require_manifold(vertices, faces, str(path))
+    vertices, faces, _ = mend(vertices * table.scale, faces, str(path))
+    require_manifold(vertices, faces, str(path), table.scale)
     if not is_closed(faces):
         raise InputError(f"{path}: the tool's surface has holes; it must be closed")
     require_outward(vertices, faces, str(path))

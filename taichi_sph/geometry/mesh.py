@@ -17,25 +17,6 @@ Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 
 
-def clean(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
-    """Merge vertices at the same place; drop collapsed triangles and vertices that none uses."""
-    if len(faces) == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    # STL repeats every corner; single precision is its grain, so compare at that grain.
-    extent = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
-    grain = max(extent, 1e-300) * 1e-7
-    keys = np.round((vertices - vertices.min(axis=0)) / grain).astype(np.int64)
-    _, first, label = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    merged = rank[label.reshape(-1)][faces]
-    vertices = vertices[first[order]]
-    a, b, c = merged.T
-    merged = merged[(a != b) & (b != c) & (c != a)]
-    return drop_unused(vertices, merged)
-
-
 def drop_unused(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Drop vertices that no triangle uses."""
     used = np.zeros(len(vertices), bool)
@@ -93,7 +74,8 @@ def is_winding_consistent(faces: Integers) -> bool:
     """Whether neighbouring triangles all turn the same way."""
     edges = directed_edges(faces)
     size = int(faces.max()) + 1
-    return len(np.unique(edges[:, 0] * size + edges[:, 1])) == len(edges)
+    key = np.sort(edges[:, 0] * size + edges[:, 1])
+    return not (key[1:] == key[:-1]).any()
 
 
 def is_closed(faces: Integers) -> bool:
@@ -330,6 +312,7 @@ def self_intersections(vertices: Floats, faces: Integers) -> Integers:
     corners = vertices[faces]
     centre = corners.mean(axis=1)
     radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    low, high = corners.min(axis=1), corners.max(axis=1)
     # Triangles by size class, so that one large triangle does not widen everyone's search.
     level = np.floor(np.log2(np.maximum(radius, radius.max() * 1e-6))).astype(int)
     classes = [np.flatnonzero(level == k) for k in np.unique(level)]
@@ -339,22 +322,44 @@ def self_intersections(vertices: Floats, faces: Integers) -> Integers:
         for j in range(i, len(classes)):
             other = classes[j]
             reach = radius[members].max() + radius[other].max()
-            pairs = trees[i].sparse_distance_matrix(trees[j], reach, output_type="coo_matrix")
-            p, q = members[pairs.row], other[pairs.col]
-            if i == j:
-                p, q = p[p < q], q[p < q]
-            _mark_crossings(corners, faces, p, q, bad)
-            _mark_crossings(corners, faces, q, p, bad)
+            for first in range(0, len(members), AT_ONCE):
+                part = members[first : first + AT_ONCE]
+                pairs = cKDTree(centre[part]).sparse_distance_matrix(
+                    trees[j], reach, output_type="ndarray"
+                )
+                p, q = part[pairs["i"]], other[pairs["j"]]
+                if i == j:
+                    p, q = p[p < q], q[p < q]
+                for axis in range(3):
+                    near = (low[p, axis] <= high[q, axis]) & (low[q, axis] <= high[p, axis])
+                    p, q = p[near], q[near]
+                _mark_crossings(corners, faces, p, q, bad)
     return np.flatnonzero(bad)
+
+
+AT_ONCE = 20_000
+"""Triangles whose neighbours are looked at together: some 50 MB."""
 
 
 def _mark_crossings(
     corners: Floats, faces: Integers, p: Integers, q: Integers, bad: Booleans
 ) -> None:
+    """Mark triangle pairs of which an edge of one pierces the other, without a common vertex."""
+    for first, second in ((p, q), (q, p)):
+        # Most lie on one side of the other's plane, which spares a closer look.
+        origin = corners[second, 0]
+        normal = np.cross(corners[second, 1] - origin, corners[second, 2] - origin)
+        height = np.stack(
+            [np.einsum("ij,ij->i", corners[first, k] - origin, normal) for k in range(3)]
+        )
+        across = (height < 0).any(axis=0) & (height > 0).any(axis=0)
+        _mark_pierced(corners, faces, first[across], second[across], bad)
+
+
+def _mark_pierced(
+    corners: Floats, faces: Integers, p: Integers, q: Integers, bad: Booleans
+) -> None:
     """Mark triangle pairs in which an edge of p pierces q and shares no vertex with it."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    near = ((low[p] <= high[q]) & (low[q] <= high[p])).all(axis=1)
-    p, q = p[near], q[near]
     for k in range(3):
         ends = faces[p][:, [k, (k + 1) % 3]]
         free = ~(ends[:, :, None] == faces[q][:, None, :]).any(axis=(1, 2))

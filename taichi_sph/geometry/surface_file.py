@@ -10,6 +10,7 @@ import numpy as np
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
+from taichi_sph.geometry.mending import gap_hint
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
 from taichi_sph.geometry.surface_formats import (
     FormatError,
@@ -132,8 +133,14 @@ def where(point: Floats) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
-def require_manifold(vertices: Floats, faces: Integers, label: str) -> None:
+def require_manifold(vertices: Floats, faces: Integers, label: str, scale: float = 1.0) -> None:
     """Refuse a surface that is not one piece of skin.
+
+    Args:
+        vertices: (n, 3).
+        faces: (m, 3).
+        label: What messages call the surface.
+        scale: Of the vertices, over the units of the file, in which places are said.
 
     Raises:
         InputError: an edge with more than two triangles, surfaces that touch at a point,
@@ -144,21 +151,22 @@ def require_manifold(vertices: Floats, faces: Integers, label: str) -> None:
         first = edges[np.argmax(uses > 2)]
         raise InputError(
             f"{label}: {int((uses > 2).sum())} edges have more than two triangles (first at "
-            f"{where(vertices[first].mean(axis=0))}); a surface needs one or two at every edge"
+            f"{where(vertices[first].mean(axis=0) / scale)}, in units of the file): a wall within "
+            "the lumen, or parts laid over each other; allowed: one or two triangles at every edge"
         )
     count, piece = mesh.components(faces, len(vertices))
     if count > 1:
         sizes = ", ".join(str(n) for n in np.sort(np.bincount(piece))[::-1][:5])
         raise InputError(
             f"{label}: {count} separate pieces (triangles: {sizes}{', ...' if count > 5 else ''}); "
-            "the lumen must be one connected surface"
+            f"the lumen must be one connected surface{gap_hint(vertices, faces, scale)}"
         )
     pinched = ~np.asarray(igl.is_vertex_manifold(faces)).reshape(-1)
     if pinched.any():
-        place = where(vertices[int(np.argmax(pinched))])
+        place = where(vertices[int(np.argmax(pinched))] / scale)
         raise InputError(
-            f"{label}: parts of the surface touch at a single vertex (first at {place}); "
-            "separate or merge them"
+            f"{label}: parts of the surface touch at a single vertex (first at {place}, in units "
+            f"of the file); separate or merge them{gap_hint(vertices, faces, scale)}"
         )
     if not mesh.is_winding_consistent(faces):
         raise InputError(

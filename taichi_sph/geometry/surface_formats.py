@@ -120,27 +120,30 @@ def _ascii_stl(text: bytes) -> Floats:
         lines.pop()  # a line without an end is where the file was cut
     # A carriage return and a line feed are one end of a line.
     step = 2 if b"\r\n" in text[:1000] else 1
+
+    def wrong(text: str) -> FormatError:
+        return FormatError(f"line {index // step + 1}: {text}")
+
     for index, line in enumerate(lines):
         words = line.split()
         while words:
             key = words[0].lower()
             if key == b"end" and len(words) > 1:
                 key, words = b"end" + words[1].lower(), words[1:]
-            place = f"line {index // step + 1}"
             if key == b"vertex":
                 if not loop:
-                    raise FormatError(f"{place}: a vertex outside a facet")
+                    raise wrong("a vertex outside a facet")
                 if len(words) < 4:
-                    raise FormatError(f"{place}: a vertex of {len(words) - 1} numbers; allowed: 3")
+                    raise wrong(f"a vertex of {len(words) - 1} numbers; allowed: 3")
                 try:
                     corners.extend((float(words[1]), float(words[2]), float(words[3])))
                 except ValueError:
                     for word in words[1:4]:
-                        to_float(word, place)
+                        to_float(word, f"line {index // step + 1}")
                 words = words[4:]
             elif key in (b"endloop", b"endfacet"):
                 if loop and len(corners) != loop:
-                    raise FormatError(f"{place}: a facet without 3 vertices; allowed: triangles")
+                    raise wrong("a facet without 3 vertices; allowed: triangles")
                 if key == b"endfacet":
                     facet = loop = 0
                 words = words[1:]
@@ -149,25 +152,23 @@ def _ascii_stl(text: bytes) -> Floats:
             elif key == b"facet":
                 if solid is None or facet:
                     where = f"within the facet of line {facet}" if facet else "outside a solid"
-                    raise FormatError(f"{place}: a facet begins {where}")
+                    raise wrong(f"a facet begins {where}")
                 facet = index // step + 1
                 # Normals are made from the corners: what the file says is not always a number.
                 words = words[5:] if len(words) > 1 and words[1].lower() == b"normal" else words[1:]
             elif key == b"solid":
                 if solid is not None:
-                    raise FormatError(
-                        f"{place}: a solid begins within {solid}; the file is damaged"
-                    )
+                    raise wrong(f"a solid begins within {solid}; the file is damaged")
                 solids += 1
                 name = b" ".join(words[1:])[:60].decode("utf-8", "replace")
                 solid, words = f"solid {name or f'number {solids}'}", []
             elif key == b"endsolid":
                 if solid is None or facet:
                     where = f"within the facet of line {facet}" if facet else "outside a solid"
-                    raise FormatError(f"{place}: a solid ends {where}; the file is damaged")
+                    raise wrong(f"a solid ends {where}; the file is damaged")
                 solid, words = None, []
             else:
-                raise FormatError(f"{place}: {printable(words[0])} is no word of an STL file")
+                raise wrong(f"{printable(words[0])} is no word of an STL file")
     if solid is not None:
         raise FormatError(f"the file ends within {solid}; it is cut")
     return np.frombuffer(corners, np.float64).reshape(-1, 3).copy()

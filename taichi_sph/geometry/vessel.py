@@ -16,6 +16,7 @@ from taichi_sph.errors import InputError
 from taichi_sph.geometry import clearance, filling, mesh, wall_sampling
 from taichi_sph.geometry.caps import flat_part_at
 from taichi_sph.geometry.interior import Interior
+from taichi_sph.geometry.mending import mend
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
 from taichi_sph.geometry.openings import (
     Candidate,
@@ -66,6 +67,8 @@ class Vessel:
     """Openings of the surface that the scene does not name: capped."""
     label: str = "surface"
     """What messages call it: the file's path."""
+    notes: tuple[str, ...] = ()
+    """What was mended in the file."""
 
     @cached_property
     def _triangles(self) -> Integers:
@@ -284,10 +287,8 @@ def build_vessel(
             f"{label}: {extent:.4g} m across at vessel.scale = {scale:g}, no vessel is; allowed: "
             f"{SMALLEST:g} to {LARGEST:g} m; if these are {kind}, set vessel.scale = {guess:g}"
         )
-    vertices, faces = mesh.clean(vertices, faces)
-    if len(faces) == 0:
-        raise InputError(f"{label}: all triangles have collapsed to lines; a tube is needed")
-    require_manifold(vertices, faces, label)
+    vertices, faces, notes = mend(vertices, faces, label)
+    require_manifold(vertices, faces, label, scale)
     vertices, faces, holes = close_holes(vertices, faces, label, scale)
     require_outward(vertices, faces, label)
     ends = find_openings(vertices, faces, holes, label, scale)
@@ -305,8 +306,9 @@ def build_vessel(
     round_ones = [c for c in others if c.from_hole or is_round(vertices, faces[c.faces], 0.82)]
     unnamed = [_opening(f"unnamed_{k}", c, False) for k, c in enumerate(round_ones, 1)]
     return Vessel(
-        vertices, faces.astype(np.int32), face_opening, tuple(named), tuple(unnamed), label
-    )
+        vertices, faces.astype(np.int32), face_opening, tuple(named), tuple(unnamed), label,
+        tuple(notes),
+    )  # fmt: skip
 
 
 def _opening(name: str, found: Candidate, is_open: bool) -> Opening:
@@ -414,6 +416,7 @@ def check_vessel(vessel: Vessel) -> list[Finding]:
         Finding(handles == 0, "no handles" if handles == 0 else f"{handles} handles (loops)"),
         crossings(vessel),
         Finding(True, f"narrowest place {1e3 * vessel.narrowest:.2f} mm"),
+        *(Finding(True, note) for note in vessel.notes),
     ]
     for opening in vessel.openings:
         state = "open" if opening.is_open else "capped"

@@ -88,7 +88,7 @@ def test_crumbs_are_left_out_and_a_second_vessel_is_refused(tmp_path: Path) -> N
         np.concatenate([vertices, crumb.vertices + [0.02, 0, 0]]),
         np.concatenate([faces, crumb.faces + len(vertices)]),
     )
-    assert "1 small loose pieces" in create_scene(path, tmp_path / "out")
+    assert "1 small loose piece," in create_scene(path, tmp_path / "out")
     mesh.write_ply(
         path,
         np.concatenate([vertices, vertices + np.array([0.02, 0, 0])]),
@@ -97,6 +97,51 @@ def test_crumbs_are_left_out_and_a_second_vessel_is_refused(tmp_path: Path) -> N
     with pytest.raises(InputError, match="2 separate pieces"):
         create_scene(path, tmp_path / "two")
     assert not (tmp_path / "two").exists()
+
+
+@pytest.mark.parametrize(
+    ("unit", "length"), [("centimetres", 1.8), ("inches", 1.5), ("centimetres", 1.1)]
+)
+def test_a_size_that_no_vessel_has_is_asked_about(tmp_path: Path, unit: str, length: float) -> None:
+    path = write_stl(tmp_path / "my.stl", scale=length / LENGTH)
+    with pytest.raises(InputError) as error:
+        create_scene(path, tmp_path / "out")
+    text = str(error.value)
+    assert "which in metres is no vessel" in text
+    assert "give --scale" in text and f"for {unit} (" in text
+    assert f"({10 * length:.3g} mm across, opening of radius {10 * length / 6:.3g} mm" in text
+    assert not (tmp_path / "out").exists()
+    scale = {"centimetres": 0.01, "inches": 0.0254}[unit]
+    create_scene(path, tmp_path / "out", scale=scale)
+    assert read_back(tmp_path / "out")[1].volume == pytest.approx(
+        np.pi * (length * scale) ** 3 / 36, rel=5e-3
+    )
+
+
+def test_centimetres_are_offered_where_they_would_do(tmp_path: Path) -> None:
+    vertices, faces = cylinder()
+    # An aorta of 34.5 cm, 2.3 cm wide, in centimetres.
+    path = tmp_path / "aorta.ply"
+    mesh.write_ply(path, vertices / LENGTH * 34.5 * [0.1, 0.1, 1.0] * [2.0, 2.0, 1.0], faces)
+    text = create_scene(path, tmp_path / "out")
+    assert "assumed millimetres, for the surface is 34.5 units across" in text
+    assert "--scale 0.01 if these are centimetres (345 mm across, opening of radius 11.5 mm" in text
+    # A tube of 30 mm, 1 cm wide: in centimetres its opening has a radius of 5 cm, 2.4 litres.
+    assert "are centimetres" not in create_scene(write_stl(tmp_path / "my.stl"), tmp_path / "other")
+
+
+def test_a_speck_far_away_does_not_decide_the_units(tmp_path: Path) -> None:
+    vertices, faces = cylinder()
+    speck = trimesh.creation.icosphere(subdivisions=1, radius=1e-4)
+    path = tmp_path / "my.ply"
+    mesh.write_ply(
+        path,
+        1e3 * np.concatenate([vertices, speck.vertices + [3.0, 0, 0]]),
+        np.concatenate([faces, speck.faces + len(vertices)]),
+    )
+    text = create_scene(path, tmp_path / "out")
+    assert "assumed millimetres, for the surface is 30 units across" in text
+    assert "1 small loose piece," in text
 
 
 def test_scale_and_spacing_are_taken(tmp_path: Path) -> None:
