@@ -9,6 +9,7 @@ import msgspec
 from rich.table import Table
 from rich.text import Text
 
+from app.scenes.driving import driving
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, read_scene
 
@@ -194,4 +195,12 @@ def info_tables(scene: Scene) -> list[Table]:
         ),
     ):
         numbers.add_row(name, value)
-    return [checks, numbers]
+    drives = driving(scene, vessel)
+    if not drives:
+        return [checks, numbers]
+    driven = _two_columns("\nwhat drives the blood")
+    for drive in drives:
+        driven.add_row(drive.name, drive.text)
+        for question in drive.questions:
+            driven.add_row(_NOTE, question)
+    return [checks, driven, numbers]
