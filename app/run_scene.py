@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from app import version
 from app.run.options import DEFAULT_ERROR, RunOptions
+from app.scenes.driving import driving
 from app.scenes.library import find_scene, weights_for, with_column
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
@@ -109,6 +110,8 @@ def _drive(options: RunOptions, run: _Start) -> "Outcome":
 
     start(options.arch, options.precision, options.threads, random_seed=options.seed)
     simulation = Simulation.from_scene(run.scene, run.factory, options.seed)
+    for driven in driving(run.scene, simulation.vessel):
+        print("\n".join(driven.lines()), file=sys.stderr)
     session = _open_session(simulation, options, run) if options.is_acted_on else None
     if session is None and run.begun is not None:
         simulation.load_state(run.begun.state)

@@ -38,6 +38,31 @@ class Waveform:
         """The factor at a time [s]."""
         return float(np.interp(time % float(self.time[-1]), self.time, self.factor))
 
+    @property
+    def period(self) -> float:
+        """Time after which it repeats [s]."""
+        return float(self.time[-1])
+
+    @property
+    def mean(self) -> float:
+        """Mean factor over a period [-]."""
+        return float(np.trapezoid(self.factor, self.time)) / self.period
+
+    @property
+    def least(self) -> float:
+        """Smallest factor [-]."""
+        return float(self.factor.min())
+
+    @property
+    def most(self) -> float:
+        """Largest factor [-]."""
+        return float(self.factor.max())
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether it never changes."""
+        return self.least == self.most
+
 
 STEADY = Waveform(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
 

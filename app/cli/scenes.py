@@ -1,5 +1,6 @@
 """`scenes`, `info` and `new`."""
 
+import os
 from pathlib import Path
 
 import click
@@ -48,6 +49,13 @@ def info(scene: str) -> None:
 )
 def new(surface: Path, out: Path | None, scale: float | None, spacing: float | None) -> None:
     """Make a scene folder of a vessel's surface (STL, PLY, OBJ, VTP, VTK), capped or open."""
+    from app.scenes.library import shipped
     from app.scenes.new_scene import create_scene
 
     click.echo(create_scene(surface, out, scale, spacing))
+    folder = Path(surface.stem) if out is None else out
+    if folder.name in shipped() and folder.parent.resolve() == Path.cwd():
+        click.echo(
+            f"{folder.name}: a shipped scene has this name too; write .{os.sep}{folder.name} "
+            "for this one"
+        )

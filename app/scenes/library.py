@@ -1,6 +1,7 @@
 """Scenes: the shipped ones, the user's own, and what one amounts to."""
 
 import difflib
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ import msgspec
 from rich.table import Table
 from rich.text import Text
 
+from app.scenes.driving import driving
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, read_scene
 
@@ -44,10 +46,15 @@ def scene_path(given: str) -> Path:
     """The file of a scene given by the name of a shipped one, by its file or by its folder.
 
     Raises:
-        InputError: there is no such scene.
+        InputError: there is no such scene, or two.
     """
     known = shipped()
     if given in known:
+        if holds_another_scene(Path(given), known[given]):
+            raise InputError(
+                f"{given}: a shipped scene and a folder here; write .{os.sep}{given} for the "
+                f"folder, {known[given]} for the shipped one"
+            )
         return known[given]
     path = Path(given)
     if path.is_dir():
@@ -55,14 +62,22 @@ def scene_path(given: str) -> Path:
         if not path.is_file():
             raise InputError(f"{given}: the folder has no scene.toml")
     elif not path.exists():
-        close = difflib.get_close_matches(given, known, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"shipped are {', '.join(known)}"
+        plain = {name.casefold(): name for name in known}
+        close = difflib.get_close_matches(given.casefold(), plain, n=1)
+        hint = f"did you mean {plain[close[0]]}?" if close else f"shipped are {', '.join(known)}"
         raise InputError(f"{given}: neither a shipped scene nor a scene file or folder; {hint}")
     elif path.suffix != ".toml":
         raise InputError(
             f"{given}: a scene is a .toml file; `vesselflow new {given}` makes one of a surface"
         )
     return path
+
+
+def holds_another_scene(folder: Path, shipped_file: Path) -> bool:
+    """Whether a folder has scenes, and is not that of a shipped one."""
+    # A file system that does not tell large letters from small finds the folder under either.
+    is_own = folder.is_dir() and folder.resolve() == shipped_file.parent.resolve()
+    return not is_own and any(folder.glob("*.toml"))
 
 
 def find_scene(given: str) -> Scene:
@@ -180,4 +195,12 @@ def info_tables(scene: Scene) -> list[Table]:
         ),
     ):
         numbers.add_row(name, value)
-    return [checks, numbers]
+    drives = driving(scene, vessel)
+    if not drives:
+        return [checks, numbers]
+    driven = _two_columns("\nwhat drives the blood")
+    for drive in drives:
+        driven.add_row(drive.name, drive.text)
+        for question in drive.questions:
+            driven.add_row(_NOTE, question)
+    return [checks, driven, numbers]
