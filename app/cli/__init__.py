@@ -1,5 +1,6 @@
 """The command line: it parses, calls one function, and turns errors into one sentence."""
 
+import logging
 import os
 import signal
 import sys
@@ -49,6 +50,17 @@ for command in (
     measure.validate, measure.bench,
 ):  # fmt: skip
     cli.add_command(command)
+
+
+class Stages(logging.Handler):
+    """What is done to a large surface, line by line on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one line."""
+        from rich.console import Console
+
+        console = Console(file=sys.stderr, highlight=False, markup=False)
+        console.print(record.getMessage(), style="dim", soft_wrap=True)
 
 
 class _Terminated(BaseException):
@@ -111,6 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     signal.signal(signal.SIGTERM, _on_sigterm)
+    log = logging.getLogger("taichi_sph")
+    log.handlers, log.propagate = [Stages()], False
+    log.setLevel(logging.INFO)
     message, code = invoke(arguments)
     view = sys.modules.get("app.view.rerun_view")
     leave(message, code, at_once=view is not None and view.viewer_stalled())

@@ -496,7 +496,7 @@ def _cut(
             np.array([[polygon[0], polygon[k], polygon[k + 1]]]) for k in range(1, len(polygon) - 1)
         ]
     faces = np.concatenate(kept)
-    count, piece = mesh.components(faces, len(vertices))
+    count, piece = mesh.components(faces)
     if count > 1:
         # The rounded tip can leave crumbs just at the plane; the lumen is the large piece.
         faces = faces[piece == np.bincount(piece).argmax()]

@@ -35,9 +35,9 @@ from app.view.appearance import (
     eye,
     speed_levels,
     upward,
-    vertex_normals,
 )
 from taichi_sph.errors import InputError
+from taichi_sph.geometry.mesh import vertex_normals
 
 if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics

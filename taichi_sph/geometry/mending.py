@@ -50,6 +50,7 @@ def mend(vertices: Floats, faces: Integers, label: str) -> tuple[Floats, Integer
     Raises:
         InputError: no triangle has an area.
     """
+    mesh.log_stage(f"joining corners of {len(faces)} triangles", len(faces))
     notes: list[str] = []
     before = len(faces)
     vertices, faces = _join_equal(vertices, faces)
@@ -89,7 +90,7 @@ def largest_piece(
     Raises:
         InputError: the largest piece has less than 0.99 of the area.
     """
-    count, piece = mesh.components(faces, len(vertices))
+    count, piece = mesh.components(faces)
     if count == 1:
         return vertices, faces, []
     area = np.linalg.norm(mesh.face_vectors(vertices, faces), axis=1)

@@ -1,15 +1,14 @@
-"""Triangle meshes as arrays: topology, caps, flat regions, self-intersections, PLY files.
+"""Triangle meshes as arrays: topology, caps, self-intersections, PLY files.
 
 Everything here is geometry on ``vertices`` (n, 3) and ``faces`` (m, 3); units are the caller's.
 """
 
+import logging
 from pathlib import Path
 
 import igl
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 Floats = NDArray[np.float64]
@@ -17,12 +16,27 @@ Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 
 
+LARGE = 100_000
+"""Triangles from which on work on a surface takes seconds."""
+
+
+def log_stage(stage: str, triangles: int) -> None:
+    """Tell Python's log what is done next to a large surface; small ones are done at once."""
+    if triangles >= LARGE:
+        logging.getLogger("taichi_sph").info(stage)
+
+
 def drop_unused(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Drop vertices that no triangle uses."""
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    number = np.cumsum(used) - 1
-    return vertices[used], number[faces]
+    if len(faces) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    kept, renumbered, _, _ = igl.remove_unreferenced(*_contiguous(vertices, faces))
+    return kept, renumbered
+
+
+def _contiguous(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
+    """Arrays as libigl takes them."""
+    return np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
 
 
 def face_vectors(vertices: Floats, faces: Integers) -> Floats:
@@ -39,9 +53,8 @@ def unit(vectors: Floats) -> Floats:
 
 def enclosed_volume(vertices: Floats, faces: Integers) -> float:
     """Volume within a closed surface; negative where the normals point inwards."""
-    origin = vertices.mean(axis=0)
-    a, b, c = (vertices[faces[:, k]] - origin for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+    # About its middle: far from the origin the parts of the sum would cancel.
+    return float(igl.moments(*_contiguous(vertices - vertices.mean(axis=0), faces))[0])
 
 
 def directed_edges(faces: Integers) -> Integers:
@@ -83,19 +96,16 @@ def is_closed(faces: Integers) -> bool:
     return bool((edge_uses(faces)[2] == 2).all())
 
 
-def components(faces: Integers, count: int) -> tuple[int, Integers]:
-    """Number of connected pieces and the piece of every triangle."""
-    edges = directed_edges(faces)
-    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
+def components(faces: Integers) -> tuple[int, Integers]:
+    """Number of pieces without a common vertex, and the piece of every triangle."""
+    label = np.asarray(igl.vertex_components(np.ascontiguousarray(faces, np.int64))).reshape(-1)
     names, of_face = np.unique(label[faces[:, 0]], return_inverse=True)
     return len(names), of_face.reshape(-1)
 
 
-def genus(vertices: Floats, faces: Integers) -> int:
+def genus(faces: Integers) -> int:
     """Handles of one closed piece: 0 for a sphere, 1 for a ring."""
-    euler = len(vertices) - len(edge_uses(faces)[0]) + len(faces)
-    return (2 - euler) // 2
+    return (2 - int(igl.euler_characteristic(np.ascontiguousarray(faces, np.int64)))) // 2
 
 
 def boundary_loops(faces: Integers) -> list[Integers]:
@@ -253,52 +263,6 @@ def _check_fill(
     return kept if whole and single == rim and is_winding_consistent(kept) else None
 
 
-def flat_regions(vertices: Floats, faces: Integers) -> list[Integers]:
-    """Flat parts of the surface with a sharp rim all round: what a cap looks like.
-
-    Returns:
-        The triangles of each region, largest area first; regions do not overlap.
-    """
-    vectors = face_vectors(vertices, faces)
-    normals = unit(vectors)
-    areas = np.linalg.norm(vectors, axis=1)
-    pairs, edges = face_pairs(faces)
-    cosine = np.einsum("ij,ij->i", normals[pairs[:, 0]], normals[pairs[:, 1]])
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    found: list[tuple[float, Integers]] = []
-    # Caps may be a little uneven, and walls a little flat, so several angles are tried.
-    for angle in (0.5, 3.0, 12.0):
-        smooth = cosine > np.cos(np.radians(angle))
-        graph = coo_matrix(
-            (np.ones(smooth.sum()), (pairs[smooth, 0], pairs[smooth, 1])),
-            shape=(len(faces), len(faces)),
-        )
-        _, label = connected_components(graph, directed=False)
-        area = np.bincount(label, areas)
-        border = label[pairs[:, 0]] != label[pairs[:, 1]]
-        sharp = border & (cosine < np.cos(np.radians(30.0)))
-        rim, hard = (
-            sum(np.bincount(label[pairs[rows, k]], length[rows], len(area)) for k in (0, 1))
-            for rows in (border, sharp)
-        )
-        for name in np.flatnonzero((hard > 0.9 * rim) & (rim > 0) & (area > 1e-4 * areas.sum())):
-            members = np.flatnonzero(label == name)
-            normal = vectors[members].sum(axis=0)
-            if np.linalg.norm(normal) < 0.9 * area[name]:
-                continue
-            normal /= np.linalg.norm(normal)
-            depth = vertices[faces[members]].reshape(-1, 3) @ normal
-            if np.ptp(depth) < 0.05 * np.sqrt(area[name] / np.pi):
-                found.append((float(area[name]), members))
-    taken = np.zeros(len(faces), bool)
-    regions = []
-    for _, members in sorted(found, key=lambda item: (-item[0], int(item[1][0]))):
-        if not taken[members].any():
-            taken[members] = True
-            regions.append(members)
-    return regions
-
-
 def region_plane(vertices: Floats, faces: Integers) -> tuple[Floats, Floats, float]:
     """Centre, mean unit normal and area of a flat set of triangles."""
     vectors = face_vectors(vertices, faces)
@@ -403,7 +367,10 @@ class NearestPoint:
 
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
-    """Unit normal at each vertex (n, 3): the mean over its triangles, weighted by area."""
+    """Unit normal at each vertex (n, 3): the mean over its triangles, weighted by area.
+
+    libigl's differ in the last bit, and with them the proxies of every shipped scene.
+    """
     vectors = face_vectors(vertices, faces)
     normals = np.zeros_like(vertices)
     for k in range(3):

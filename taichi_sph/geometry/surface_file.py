@@ -51,6 +51,8 @@ def load_surface(path: Path) -> tuple[Floats, Integers]:
             f"{path}: not a readable {kind or '(none)'} surface; allowed: {FORMATS}"
             + (f"; {HINT}" if kind.startswith((".vt", ".pvt")) else "")
         )
+    # A triangle takes some 50 bytes in most formats.
+    mesh.log_stage(f"reading {path.name}, {len(data) / 1e6:.0f} MB", len(data) // 50)
     try:
         polygons = READERS[kind](data)
         faces = triangulate(polygons)
@@ -146,6 +148,7 @@ def require_manifold(vertices: Floats, faces: Integers, label: str, scale: float
         InputError: an edge with more than two triangles, surfaces that touch at a point,
             triangles that turn different ways, several pieces.
     """
+    mesh.log_stage(f"checking edges and corners of {len(faces)} triangles", len(faces))
     edges, _, uses = mesh.edge_uses(faces)
     if (uses > 2).any():
         first = edges[np.argmax(uses > 2)]
@@ -154,7 +157,7 @@ def require_manifold(vertices: Floats, faces: Integers, label: str, scale: float
             f"{where(vertices[first].mean(axis=0) / scale)}, in units of the file): a wall within "
             "the lumen, or parts laid over each other; allowed: one or two triangles at every edge"
         )
-    count, piece = mesh.components(faces, len(vertices))
+    count, piece = mesh.components(faces)
     if count > 1:
         sizes = ", ".join(str(n) for n in np.sort(np.bincount(piece))[::-1][:5])
         raise InputError(

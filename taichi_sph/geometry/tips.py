@@ -39,7 +39,7 @@ def find_tips(vertices: Floats, faces: Integers) -> list[Tip]:
 
     A surface with handles has none: where two ways round meet is no end.
     """
-    if mesh.genus(vertices, faces) > 0:
+    if mesh.genus(faces) > 0:
         return []
     area = float(np.linalg.norm(mesh.face_vectors(vertices, faces), axis=1).sum())
     radius = 2.0 * abs(mesh.enclosed_volume(vertices, faces)) / area

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import clearance, filling, mesh, wall_sampling
 from taichi_sph.geometry.caps import flat_part_at
+from taichi_sph.geometry.closed_surface import ClosedSurface
 from taichi_sph.geometry.interior import Interior
 from taichi_sph.geometry.mending import mend
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
@@ -75,14 +75,8 @@ class Vessel:
         return np.ascontiguousarray(self.faces, np.int64)
 
     @cached_property
-    def _winding(self) -> igl.FastWindingNumberBVH:
-        tree = igl.FastWindingNumberBVH()
-        tree.init(self.vertices, self._triangles)
-        return tree
-
-    @cached_property
-    def _nearest(self) -> mesh.NearestPoint:
-        return mesh.NearestPoint(self.vertices, self._triangles)
+    def _surface(self) -> ClosedSurface:
+        return ClosedSurface(self.vertices, self._triangles)
 
     @cached_property
     def _interior(self) -> Interior:
@@ -125,14 +119,11 @@ class Vessel:
 
     def contains(self, points: Floats) -> Booleans:
         """Which points (k, 3) [m] lie within the lumen."""
-        if len(points) == 0:
-            return np.zeros(0, bool)
-        points = np.ascontiguousarray(points, np.float64)
-        return np.asarray(self._winding.winding_number(points)).reshape(-1) > 0.5
+        return self._surface.contains(points)
 
     def distance(self, points: Floats) -> Floats:
         """Distance of points (k, 3) to the closed surface [m], (k,)."""
-        return self._nearest(points)[0]
+        return self._surface.distance(points)
 
     def nearest_wall(self, points: Floats) -> tuple[Floats, Integers, Floats, Floats]:
         """Places on the surface nearest to points (k, 3) [m].
@@ -140,7 +131,7 @@ class Vessel:
         Returns:
             distances [m] (k,), triangles (k,), places [m] (k, 3), unit normals outward (k, 3).
         """
-        away, triangle, places = self._nearest(points)
+        away, triangle, places = self._surface.nearest(points)
         normals = wall_sampling.normals_at(self.vertices, self._triangles, places, triangle)
         return away, triangle, places, normals
 
@@ -152,7 +143,7 @@ class Vessel:
 
     def signed_distance(self, points: Floats) -> Floats:
         """Distance of points (k, 3) to the closed surface [m], negative within the lumen, (k,)."""
-        return np.where(self.contains(points), -1.0, 1.0) * self.distance(points)
+        return self._surface.signed_distance(points)
 
     def count_leaks(self, points: Floats, tolerance: float = 0.0) -> int:
         """Points (k, 3) that have left the lumen other than through an open opening.
@@ -194,6 +185,7 @@ class Vessel:
         stored = wall_sampling.load_cached(key)
         if stored is not None:
             return stored
+        mesh.log_stage("spreading proxies over the wall", len(faces))
         points, nearest = wall_sampling.relaxed_points(self.vertices, faces, spacing, seed)
         figures = wall_sampling.spacing_statistics(points, self.vertices, faces, spacing)
         normals = wall_sampling.normals_at(self.vertices, faces, points, nearest)
@@ -225,6 +217,7 @@ class Vessel:
 
     @cached_property
     def _narrowest_place(self) -> tuple[float, int]:
+        mesh.log_stage("finding the narrowest place", len(self.faces))
         ends = [(o.centre, o.normal, o.radius) for o in self.openings if o.is_open]
         return clearance.narrowest_place(
             self.vertices, self._triangles, self.wall_faces, ends, self.contains
@@ -289,6 +282,7 @@ def build_vessel(
         )
     vertices, faces, notes = mend(vertices, faces, label)
     require_manifold(vertices, faces, label, scale)
+    mesh.log_stage("finding openings", len(faces))
     vertices, faces, holes = close_holes(vertices, faces, label, scale)
     require_outward(vertices, faces, label)
     ends = find_openings(vertices, faces, holes, label, scale)
@@ -387,6 +381,7 @@ def read_vessel(scene: Scene) -> Vessel:
 def crossings(vessel: Vessel) -> Finding:
     """Whether triangles cut through each other; at the rim of an opening that does no harm."""
     faces = np.asarray(vessel.faces, np.int64)
+    mesh.log_stage("looking for triangles that cut others", len(faces))
     crossed = mesh.self_intersections(vessel.vertices, faces)
     rim = np.zeros(len(vessel.vertices), bool)
     rim[faces[vessel.face_opening >= 0]] = True
@@ -409,7 +404,7 @@ def check_vessel(vessel: Vessel) -> list[Finding]:
     low, high = vessel.bounds
     size = " x ".join(f"{1e3 * value:.1f}" for value in high - low)
     closed = mesh.is_closed(faces)
-    handles = mesh.genus(vessel.vertices, faces)
+    handles = mesh.genus(faces)
     findings = [
         Finding(closed, "closed" if closed else "not closed"),
         Finding(True, f"{len(faces)} triangles, {size} mm, lumen {vessel.volume * 1e6:.4g} ml"),

@@ -22,7 +22,6 @@ from app.view.appearance import (
     eye,
     speed_levels,
     upward,
-    vertex_normals,
 )
 from app.view.rerun_view import PLOTS, RerunView
 from fake_simulation import FakeSimulation
@@ -39,6 +38,7 @@ from recordings import (
 )
 from taichi_sph.boundary.wounds import Wound
 from taichi_sph.errors import InputError
+from taichi_sph.geometry.mesh import vertex_normals
 
 FAKE = ROOT / "tests" / "helpers" / "fake_simulation.py"
 PATIENCE = 120.0

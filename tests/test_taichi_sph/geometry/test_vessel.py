@@ -22,6 +22,7 @@ from meshes import (
 from places import VESSELS
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh, wall_sampling
+from taichi_sph.geometry.caps import find_caps
 from taichi_sph.geometry.interior import Interior
 from taichi_sph.geometry.vessel import Vessel, build_vessel, check_vessel, read_vessel
 from taichi_sph.scene import Column, OpeningTable, read_scene
@@ -365,8 +366,8 @@ def test_scenes_of_the_papers_sizes_hold_16_000_and_32_000(name: str) -> None:
 def test_a_column_stays_in_the_leg_of_its_opening() -> None:
     vertices, faces = bent()
     ends = [
-        mesh.region_plane(vertices, faces[region])[0]
-        for region in mesh.flat_regions(vertices, faces)
+        mesh.region_plane(vertices, faces[cap.faces])[0]
+        for cap in find_caps(vertices, faces, "bend")
     ]
     left, right = sorted(ends, key=lambda centre: centre[0])
     openings = {
