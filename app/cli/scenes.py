@@ -47,12 +47,17 @@ def info(scene: str) -> None:
     metavar="METRES",
     help="Distance between blood particles [m].  [default: fits the narrowest place]",
 )
-def new(surface: Path, out: Path | None, scale: float | None, spacing: float | None) -> None:
+@click.option(
+    "--smooth", is_flag=True, help="Smooth the surface: needed of one straight from voxels."
+)
+def new(
+    surface: Path, out: Path | None, scale: float | None, spacing: float | None, smooth: bool
+) -> None:
     """Make a scene folder of a vessel's surface (STL, PLY, OBJ, VTP, VTK), capped or open."""
     from app.scenes.library import shipped
     from app.scenes.new_scene import create_scene
 
-    click.echo(create_scene(surface, out, scale, spacing))
+    click.echo(create_scene(surface, out, scale, spacing, smooth))
     folder = Path(surface.stem) if out is None else out
     if folder.name in shipped() and folder.parent.resolve() == Path.cwd():
         click.echo(

@@ -15,7 +15,8 @@ from taichi_sph.scene import Scene, read_scene
 
 if TYPE_CHECKING:
     from taichi_sph.derived import Derived
-    from taichi_sph.geometry.vessel import Finding, Vessel
+    from taichi_sph.geometry.findings import Finding
+    from taichi_sph.geometry.vessel import Vessel
     from taichi_sph.geometry.wall_sampling import WallSample
 
 
@@ -142,7 +143,8 @@ def measure(scene: Scene) -> tuple["Vessel", "list[Finding]", "WallSample", "Der
         InputError: the surface cannot be used, or the column does not fit.
     """
     from taichi_sph.derived import derive
-    from taichi_sph.geometry.vessel import check_vessel, read_vessel
+    from taichi_sph.geometry.findings import check_vessel
+    from taichi_sph.geometry.vessel import read_vessel
 
     vessel = read_vessel(scene)
     grid = scene.discretization

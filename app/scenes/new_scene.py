@@ -10,9 +10,11 @@ import numpy as np
 
 from app.scenes.assumptions import choose_column, choose_gravity
 from app.scenes.scene_folder import publish, readme_text, scene_text
+from app.scenes.smoothing import smoothed
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.caps import BULGE
+from taichi_sph.geometry.findings import crossings, text_of
 from taichi_sph.geometry.mending import largest_piece, mend
 from taichi_sph.geometry.mesh import Floats, Integers
 from taichi_sph.geometry.openings import Ends, close_holes, find_openings
@@ -22,7 +24,6 @@ from taichi_sph.geometry.vessel import (
     SMALLEST,
     Vessel,
     build_vessel,
-    crossings,
 )
 from taichi_sph.scene import OpeningTable
 
@@ -35,7 +36,11 @@ LARGEST_VOLUME = 1e-3
 
 
 def create_scene(
-    path: Path, out: Path | None = None, scale: float | None = None, spacing: float | None = None
+    path: Path,
+    out: Path | None = None,
+    scale: float | None = None,
+    spacing: float | None = None,
+    smooth: bool = False,
 ) -> str:
     """Turn a surface file into a folder with lumen.ply, scene.toml and README.md.
 
@@ -45,6 +50,7 @@ def create_scene(
         out: Folder to make; it must not exist.  None: the file's name, in the working directory.
         scale: Metres per unit of the file; None guesses it from the size.
         spacing: Distance between blood particles [m]; None chooses it.
+        smooth: Whether to smooth the surface, as one straight from voxels needs.
 
     Returns:
         What was found and assumed, line by line.
@@ -63,7 +69,8 @@ def create_scene(
     # In units of the file: a speck far away shall not decide what they are.
     vertices, faces = _tidy(vertices, faces, str(path), notes)
     given, scale = scale, _guess_scale(vertices, scale, path)
-    ends = _openings(vertices * scale, faces, str(path), scale, notes)
+    vertices, faces = smoothed(vertices * scale, faces, str(path), scale, smooth, notes)
+    ends = _openings(vertices, faces, str(path), scale, notes)
     notes.insert(0, _describe_units(ends, scale, given, path))
     vertices, faces = ends.vertices, ends.faces
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
@@ -186,7 +193,7 @@ def _openings(
         faces = np.ascontiguousarray(faces[:, ::-1])
         closed, closed_faces, holes = close_holes(vertices, faces, label, scale)
         notes.append("normals: pointed inwards; turned round")
-    ends = find_openings(closed, closed_faces, holes, label, scale, thorough=True)
+    ends = find_openings(closed, closed_faces, holes, label, scale, "both")
     for cap in ends.doubtful:
         if cap.bulge > BULGE:
             raise InputError(
@@ -227,27 +234,22 @@ def _too_few(ends: Ends, scale: float) -> str:
     )
 
 
-def _millimetres(place: Floats) -> str:
-    """A place [m] as text in millimetres, to a tenth of a micrometre."""
-    return where(np.round(1e3 * place, 4) + 0.0)
-
-
 def _describe(vessel: Vessel, ends: Ends, middle: Floats, notes: list[str]) -> None:
     notes.append(f"lumen: {vessel.volume * 1e6:.4g} ml, {len(vessel.faces)} triangles, closed")
     crossed = crossings(vessel)
     notes.append(crossed.text if crossed.good else f"warning: {crossed.text}; blood may leak there")
     for opening in vessel.openings:
         notes.append(
-            f"{opening.name}: at {_millimetres(opening.centre)} mm, radius "
+            f"{opening.name}: at {text_of(opening.centre)}, radius "
             f"{1e3 * opening.radius:.3g} mm; assumed open"
         )
     for cap in ends.doubtful:
         notes.append(
-            f"flat end not taken: at {_millimetres(cap.centre - middle)} mm, radius "
+            f"flat end not taken: at {text_of(cap.centre - middle)}, radius "
             f"{1e3 * cap.radius:.3g} mm: {cap.what_is_wrong}; it is wall"
         )
     for tip in ends.blind:
         notes.append(
-            f"blind end: at {_millimetres(tip.place - middle)} mm, radius "
+            f"blind end: at {text_of(tip.place - middle)}, radius "
             f"{1e3 * tip.radius:.3g} mm, closed and rounded off: it is wall"
         )

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
@@ -21,6 +22,11 @@ from taichi_sph.scene import Column
 
 _TOLERANCE = 1e-3
 """Slack of distances, over the spacing: surfaces are stored in single precision."""
+CLEAR = 0.9
+"""Blood begins no nearer to a proxy than half a spacing and this part of the setback; calibrated is
+the whole of it.  A proxy so near adds 0.08 rho_0 and moves blood at 4 % of the sound speed within a
+step; one at 0.4 of it, where a sharp rim presses proxies to, 1.0 rho_0 and at seven times the sound
+speed: the run diverges."""
 _BLOCKED = 0.05
 """Half-way between two neighbours the wall is farther than this [spacings], or it is between them:
 each of them keeps half a spacing."""
@@ -314,3 +320,11 @@ def _shallowest(
     aside = np.linalg.norm(chosen - last.mean(axis=0), axis=1)
     order = np.lexsort((column, row, np.round(aside / spacing, 6), layer))[:wanted]
     return chosen[order][::-1].copy()
+
+
+def clear_of_proxies(blood: Floats, proxies: Floats, spacing: float, setback: float) -> Booleans:
+    """Which blood (n, 3) [m] is as far from all proxies (m, 3) [m] as it can begin, (n,)."""
+    if len(blood) == 0 or len(proxies) == 0:
+        return np.ones(len(blood), bool)
+    least = 0.5 * spacing + CLEAR * setback
+    return np.asarray(cKDTree(proxies).query(blood, distance_upper_bound=least)[0] >= least)

@@ -6,6 +6,7 @@ Mistakes in the file are errors that say what was found and what to change.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from taichi_sph.geometry.mesh import Floats, Integers
 from taichi_sph.geometry.surface_file import where
 from taichi_sph.geometry.tips import Tip, find_tips
 
+Search = Literal["rims", "tips", "both"]
+"""Where ends are looked for."""
+
 FEWEST_EDGES = 6
 """A hole of fewer edges is a triangle or two that are missing, no end of a tube."""
-AT_TIP = 1.6
-"""An end is a tip's if the tip is no farther from its middle [radii]: at the far side of a cut at
-60 degrees it is 1.41."""
+AT_TIP = 0.5
+"""An end is a tip's if its cap is no farther from it [radii]: nearly always the tip is on it."""
 HALF = 0.5
 """A cap smaller than this is a facet at the end of a branch [radii of the branch]."""
 LEVEL = 0.05
@@ -194,7 +197,7 @@ def _refuse_concentric(vertices: Floats, loops: list[Integers], label: str, scal
 
 def find_openings(
     vertices: Floats, faces: Integers, holes: list[Candidate], label: str, scale: float = 1.0,
-    thorough: bool = False,
+    search: Search = "rims",
 ) -> Ends:  # fmt: skip
     """Find the ends of a closed surface, and make their caps flat.
 
@@ -204,8 +207,8 @@ def find_openings(
         holes: What `close_holes` has closed.
         label: What messages call the surface.
         scale: Metres per unit of the file, in which messages give places.
-        thorough: Whether to follow the branches to their tips: ends whose rims have been rounded
-            off, flat ends that are far from round, and blind ends are found only so.
+        search: Where to look: at sharp rims, at the tips of the branches, where ends whose rims
+            have been rounded off, oval ones and blind ends are found too, or at both.
 
     Raises:
         InputError: the surface is that of a wall.
@@ -218,8 +221,11 @@ def find_openings(
     ends = [cap for cap in found if cap.is_end]
     doubtful: list[Cap] = []
     blind: list[Tip] = []
-    if thorough:
-        ends, doubtful, blind = _at_tips(vertices, faces, holes, found)
+    if search != "rims":
+        # A piece of wall may be as flat as a small cap; away from tips only what is quite flat
+        # counts.
+        level = [cap for cap in ends if cap.rim_height < LEVEL and search == "both"]
+        ends, doubtful, blind = _at_tips(vertices, faces, holes, found, level)
     flat = [
         Candidate(*mesh.region_plane(vertices, faces[c.faces]), c.faces, from_hole=False)
         for c in ends
@@ -232,24 +238,28 @@ def find_openings(
 
 
 def _at_tips(
-    vertices: Floats, faces: Integers, holes: list[Candidate], found: list[Cap]
+    vertices: Floats, faces: Integers, holes: list[Candidate], found: list[Cap], chosen: list[Cap]
 ) -> tuple[list[Cap], list[Cap], list[Tip]]:
-    """The caps that are ends, those at tips that are none, and the blind tips."""
-    # A piece of wall may be as flat as a small cap; away from tips only what is quite flat counts.
-    chosen = [cap for cap in found if cap.is_end and cap.rim_height < LEVEL]
+    """The caps that are ends, those at tips that are none, and the blind tips.
+
+    `found` are all caps with a rim, `chosen` those that are ends wherever they are.
+    """
     doubtful, blind = [], []
     for tip in find_tips(vertices, faces):
-        if any(np.linalg.norm(h.centre - tip.place) < AT_TIP * h.radius for h in holes):
+        if tip.radius == 0.0:
+            continue
+        away = np.linalg.norm(vertices[faces] - tip.place, axis=2).min(axis=1)
+        if any(away[hole.faces].min() < AT_TIP * hole.radius for hole in holes):
             continue
         there = [
-            c
-            for c in found
-            if c.radius > HALF * tip.radius
-            and np.linalg.norm(c.centre - tip.place) < AT_TIP * c.radius
+            cap
+            for cap in found
+            if cap.radius > HALF * tip.radius and away[cap.faces].min() < AT_TIP * cap.radius
         ]
-        there.sort(key=lambda c: float(np.linalg.norm(c.centre - tip.place)) / c.radius)
+        # Beside a true end a coarse or stepped wall has flats of its own.
+        there.sort(key=lambda cap: (not cap.is_end, abs(math.log(cap.radius / tip.radius))))
         blunt = caps.blunt_cap(vertices, faces, tip)
-        if blunt is not None and not HALF < blunt.radius / max(tip.radius, 1e-300) < 1.5:
+        if blunt is not None and not HALF < blunt.radius / tip.radius < 1.5:
             blunt = None
         # A branch that ends so ends there, round or not.
         cut = [

@@ -52,20 +52,24 @@ def find_tips(vertices: Floats, faces: Integers) -> list[Tip]:
     start = int(dijkstra(graph, indices=0).argmax())
     away = np.asarray(dijkstra(graph, indices=start))
     tips = _maxima(graph, away, STANDS_OUT * radius)
-    back = np.asarray(dijkstra(graph, indices=tips[0]))
-    ends = [_tip(vertices, faces, away, tip) for tip in tips]
-    return [*ends, _tip(vertices, faces, back, start)]
+    ends = [_tip(vertices, faces, away, tip, out) for tip, out in tips]
+    # The start is a tip as well; as seen from the farthest it is a maximum.
+    back = np.asarray(dijkstra(graph, indices=tips[0][0]))
+    tips = _maxima(graph, back, STANDS_OUT * radius)
+    near = min(tips, key=lambda found: float(np.linalg.norm(vertices[found[0]] - vertices[start])))
+    return [*ends, _tip(vertices, faces, back, *near)]
 
 
-def _maxima(graph: csr_matrix, height: Floats, least: float) -> list[int]:
-    """Vertices at maxima that stand out by `least`, the highest first.
+def _maxima(graph: csr_matrix, height: Floats, least: float) -> list[tuple[int, float]]:
+    """Vertices at maxima that stand out by `least`, and by how much, the highest first.
 
     From the highest vertex down, the parts of what lies above the water line are joined; where two
     meet, the lower one's top stands out by its height over that place.
     """
     part = np.full(len(height), -1)
     top: dict[int, int] = {}
-    found = []
+    found: list[tuple[int, float]] = []
+    cut: dict[int, float] = {}
 
     def root(k: int) -> int:
         while part[k] != k:
@@ -83,23 +87,32 @@ def _maxima(graph: csr_matrix, height: Floats, least: float) -> list[int]:
             if a == b:
                 continue
             low, high = sorted((a, b), key=lambda k: (height[top[k]], -top[k]))
-            if height[top[low]] - height[here] >= least:
-                found.append(top[low])
+            out = float(height[top[low]] - height[here])
+            if out >= least:
+                found.append((top[low], out))
+                # The higher one is cut off from this one here too.
+                cut.setdefault(top[high], float(height[top[high]] - height[here]))
             part[low] = high
-    return [int(height.argmax()), *sorted(found, key=lambda k: -height[k])]
+    highest = int(height.argmax())
+    found = [(highest, float(np.ptp(height))), *sorted(found, key=lambda f: -height[f[0]])]
+    return [(tip, min(out, cut.get(tip, out))) for tip, out in found]
 
 
-def _tip(vertices: Floats, faces: Integers, away: Floats, tip: int) -> Tip:
-    """The end of a branch from its farthest vertex, cut off three radii down the branch."""
+def _tip(vertices: Floats, faces: Integers, away: Floats, tip: int, out: float) -> Tip:
+    """The end of a branch from its farthest vertex, cut off three radii down the branch.
+
+    At any rate before it meets another, `out` below its tip.
+    """
     depth = away[tip] - away[faces].max(axis=1)
     pairs, _ = mesh.face_pairs(faces)
     vectors = mesh.face_vectors(vertices, faces)
     reach = 1e-9 * float(np.ptp(vertices, axis=0).max())
     members = np.flatnonzero((faces == tip).any(axis=1))
     for _ in range(12):
+        reach = min(reach, 0.95 * out)
         members = _part(depth < max(reach, 1e-300), pairs, int(members[0]), members)
         radius = math.sqrt(float(np.linalg.norm(vectors[members].sum(axis=0))) / math.pi)
-        if reach >= 3.0 * radius:
+        if reach >= min(3.0 * radius, 0.95 * out):
             break
         reach = 3.5 * radius if reach < radius else 1.3 * reach
     axis = mesh.unit(vectors[members].sum(axis=0))

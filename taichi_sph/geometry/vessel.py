@@ -4,6 +4,7 @@ The surface is where blood ends.  A file may bring it closed, with flat caps, or
 open ends are capped here.  Mistakes in the file are errors that say what to change.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +16,7 @@ from taichi_sph.errors import InputError
 from taichi_sph.geometry import clearance, filling, mesh, wall_sampling
 from taichi_sph.geometry.caps import flat_part_at
 from taichi_sph.geometry.closed_surface import ClosedSurface
+from taichi_sph.geometry.gaps import gaps_at
 from taichi_sph.geometry.interior import Interior
 from taichi_sph.geometry.mending import mend
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
@@ -39,16 +41,15 @@ LARGEST = 2.0
 """A larger surface was given in other units than it claims [m]."""
 SMALLEST = 1e-3
 """And a smaller one [m]."""
+_GRAIN = 0.05
+"""What lies beyond an opening is looked for so finely [radii of the opening] ..."""
+_MOST_SAMPLES = 100_000
+"""... and by no more points."""
+GAP = 3.0
+"""Wider gaps between parts of the lumen side by side are nobody's concern [setbacks]: beyond 2.6 of
+them blood's first layer feels no proxy of the other part, at a support radius of 2 spacings."""
 LEAST_ACROSS = 4.0
 """Particles across the narrowest place below which nothing can be resolved."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the check of a surface."""
-
-    good: bool
-    text: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +82,11 @@ class Vessel:
     @cached_property
     def _interior(self) -> Interior:
         return Interior(*self.bounds, self.volume, self.signed_distance)
+
+    @cached_property
+    def _clear(self) -> dict[tuple[int, float], float]:
+        """What `clear_beyond` has found."""
+        return {}
 
     @cached_property
     def wall_faces(self) -> Integers:
@@ -141,6 +147,47 @@ class Vessel:
         longest = max(loops, key=len)
         return self.vertices[longest]
 
+    def clear_beyond(self, number: int, radii: float) -> float:
+        """How far from its middle, beyond opening `number`'s plane, nothing of the lumen lies [m].
+
+        At most so many of its radii: another branch may pass by there, whose blood has not left.
+
+        Raises:
+            InputError: the lumen lies right beyond the opening.
+        """
+        key = (number, radii)
+        if key not in self._clear:
+            self._clear[key] = self._find_clear(number, radii * self.openings[number].radius)
+        return self._clear[key]
+
+    def _find_clear(self, number: int, most: float) -> float:
+        opening = self.openings[number]
+        corners = self.vertices[self._triangles]
+        middles = corners.mean(axis=1)
+        size = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+        apart = middles - opening.centre
+        near = (np.linalg.norm(apart, axis=1) < most + size) & (apart @ opening.normal > -size)
+        faces = self._triangles[near & (self.face_opening != number)]
+        area = float(np.linalg.norm(mesh.face_vectors(self.vertices, faces), axis=1).sum())
+        count = min(_MOST_SAMPLES, int(area / (_GRAIN * opening.radius) ** 2) + 1)
+        if area == 0.0:
+            return most
+        grain = max(_GRAIN * opening.radius, math.sqrt(area / count))
+        apart = wall_sampling.stratified_points(self.vertices, faces, count, seed=0)
+        apart -= opening.centre
+        beyond = apart[apart @ opening.normal > grain]
+        closest = float(np.linalg.norm(beyond, axis=1).min(initial=np.inf)) - grain
+        if closest >= most:
+            return most
+        rim = float(np.linalg.norm(self.rim(number) - opening.centre, axis=1).max())
+        if closest < 0.9 * rim:
+            raise InputError(
+                f"openings.{opening.name}: another part of the lumen of {self.label} lies right "
+                f"beyond it, {1e3 * max(closest, 0.0):.3g} mm from its middle, so that blood "
+                "cannot leave; cut that end farther back, or set its state to capped"
+            )
+        return max(closest, rim)
+
     def signed_distance(self, points: Floats) -> Floats:
         """Distance of points (k, 3) to the closed surface [m], negative within the lumen, (k,)."""
         return self._surface.signed_distance(points)
@@ -155,11 +202,11 @@ class Vessel:
         points = np.asarray(points, np.float64)
         points = points[~self._interior.holds(points)]
         outside = points[~self.contains(points)]
-        for opening in self.openings:
+        for number, opening in enumerate(self.openings):
             if opening.is_open:
                 apart = outside - opening.centre
                 left = (apart @ opening.normal > -tolerance) & (
-                    np.linalg.norm(apart, axis=1) < 3.0 * opening.radius
+                    np.linalg.norm(apart, axis=1) < self.clear_beyond(number, 3.0)
                 )
                 outside = outside[~left]
         if tolerance > 0.0:
@@ -171,8 +218,9 @@ class Vessel:
 
         The points are even on the lumen's surface and then moved along its outward normal; those
         that this brings nearer to the lumen than 0.4 of the setback (in the crotch of a
-        bifurcation, or between branches that touch) are dropped.  At an open end none stands
-        beyond the opening's plane.
+        bifurcation) are dropped.  Between parts of the lumen that lie side by side none goes
+        farther than half-way: dropped, they would leave a hole from one into the other.  At an
+        open end none stands beyond the opening's plane.
 
         Args:
             spacing: Distance between proxies [m]; wall area / spacing^2 of them are made.
@@ -189,19 +237,25 @@ class Vessel:
         points, nearest = wall_sampling.relaxed_points(self.vertices, faces, spacing, seed)
         figures = wall_sampling.spacing_statistics(points, self.vertices, faces, spacing)
         normals = wall_sampling.normals_at(self.vertices, faces, points, nearest)
-        positions = points + setback * normals
+        # A coarser spacing than the proxies' own makes the pairs fewer, where they are dense.
+        gaps = gaps_at(
+            self.vertices, faces, points, nearest, normals, max(spacing, setback), GAP * setback
+        )
+        positions = points + np.minimum(setback, 0.5 * gaps)[:, None] * normals
         for opening in self.openings:
             if opening.is_open:
                 apart = positions - opening.centre
                 beyond = np.maximum(apart @ opening.normal, 0.0)
                 beyond[np.linalg.norm(points - opening.centre, axis=1) > 3.0 * opening.radius] = 0.0
                 positions -= beyond[:, None] * opening.normal
-        kept = (
-            self.signed_distance(positions) > 0.4 * setback
-            if setback > 0
-            else np.ones(len(points), bool)
-        )
-        sample = WallSample(positions[kept], normals[kept], *figures, int((~kept).sum()))
+        kept = gaps < 2.0 * setback
+        kept |= setback <= 0
+        kept[~kept] = self.signed_distance(positions[~kept]) > 0.4 * setback
+        x, y, z = points[gaps.argmin()].tolist() if len(points) else (0.0, 0.0, 0.0)
+        sample = WallSample(
+            positions[kept], normals[kept], *figures, int((~kept).sum()),
+            float(gaps.min(initial=np.inf)), (x, y, z),
+        )  # fmt: skip
         wall_sampling.store_cached(key, sample)
         return sample
 
@@ -287,7 +341,7 @@ def build_vessel(
     require_outward(vertices, faces, label)
     ends = find_openings(vertices, faces, holes, label, scale)
     if any(not _near(ends, np.array(table.centre) * scale) for table in openings.values()):
-        ends = find_openings(vertices, faces, holes, label, scale, thorough=True)
+        ends = find_openings(vertices, faces, holes, label, scale, "both")
     vertices, faces = ends.vertices, ends.faces
     matched = _match(openings, ends, scale, label)
     face_opening = np.full(len(faces), -1, np.int32)
@@ -376,54 +430,3 @@ def read_vessel(scene: Scene) -> Vessel:
     vessel.opening(scene.column.opening)
     vessel.require_resolution(scene.discretization.spacing)
     return vessel
-
-
-def crossings(vessel: Vessel) -> Finding:
-    """Whether triangles cut through each other; at the rim of an opening that does no harm."""
-    faces = np.asarray(vessel.faces, np.int64)
-    mesh.log_stage("looking for triangles that cut others", len(faces))
-    crossed = mesh.self_intersections(vessel.vertices, faces)
-    rim = np.zeros(len(vessel.vertices), bool)
-    rim[faces[vessel.face_opening >= 0]] = True
-    inner = crossed[~rim[faces[crossed]].any(axis=1)]
-    if len(inner):
-        place = where(1e3 * vessel.vertices[faces[inner[0]]].mean(axis=0))
-        return Finding(
-            False, f"{len(inner)} triangles of the wall cut through others, first at {place} mm"
-        )
-    if len(crossed):
-        return Finding(
-            True, f"self-intersections only at openings' rims ({len(crossed)} triangles)"
-        )
-    return Finding(True, "no self-intersections")
-
-
-def check_vessel(vessel: Vessel) -> list[Finding]:
-    """What `vesselflow info` says about a surface."""
-    faces = np.asarray(vessel.faces, np.int64)
-    low, high = vessel.bounds
-    size = " x ".join(f"{1e3 * value:.1f}" for value in high - low)
-    closed = mesh.is_closed(faces)
-    handles = mesh.genus(faces)
-    findings = [
-        Finding(closed, "closed" if closed else "not closed"),
-        Finding(True, f"{len(faces)} triangles, {size} mm, lumen {vessel.volume * 1e6:.4g} ml"),
-        Finding(handles == 0, "no handles" if handles == 0 else f"{handles} handles (loops)"),
-        crossings(vessel),
-        Finding(True, f"narrowest place {1e3 * vessel.narrowest:.2f} mm"),
-        *(Finding(True, note) for note in vessel.notes),
-    ]
-    for opening in vessel.openings:
-        state = "open" if opening.is_open else "capped"
-        findings.append(
-            Finding(True, f"opening {opening.name}: {state}, radius {1e3 * opening.radius:.2f} mm")
-        )
-    for opening in vessel.unnamed:
-        findings.append(
-            Finding(
-                False,
-                f"flat end at {where(1e3 * opening.centre)} mm, radius "
-                f"{1e3 * opening.radius:.2f} mm, not named by the scene: capped",
-            )
-        )
-    return findings

@@ -23,7 +23,7 @@ from taichi_sph.geometry.mesh import (
 )
 from taichi_sph.system import replaced
 
-ALGORITHM = 1
+ALGORITHM = 2
 """Change it when the points change: it is part of the cache's key."""
 _ROUNDS = 12
 _REACH = 2.0
@@ -49,6 +49,10 @@ class WallSample:
     """Largest distance from a place on the wall to its nearest point, over the spacing [-]."""
     dropped: int
     """Points left out because setting them back put them into or against another branch."""
+    narrowest_gap: float
+    """Least width of a gap between parts of the lumen side by side [m]; infinite without one."""
+    gap_place: tuple[float, float, float]
+    """Where it is [m]."""
 
 
 def _spread_bits(x: Integers) -> Integers:
@@ -165,13 +169,13 @@ def load_cached(key: str) -> WallSample | None:
     try:
         with _cache_file(key).open("rb") as file, np.load(file, allow_pickle=False) as data:
             positions, normals = data["positions"], data["normals"]
-            mean, spread, least, gap, dropped = data["figures"]
+            mean, spread, least, gap, dropped, narrow, x, y, z = map(float, data["figures"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     whole = positions.shape == normals.shape and positions.ndim == 2 and positions.shape[1] == 3
     if not whole or not (np.isfinite(positions).all() and np.isfinite(normals).all()):
         return None
-    figures = (float(mean), float(spread), float(least), float(gap), int(dropped))
+    figures = (mean, spread, least, gap, int(dropped), narrow, (x, y, z))
     return WallSample(positions, normals, *figures)
 
 
@@ -185,6 +189,8 @@ def store_cached(key: str, sample: WallSample) -> None:
         sample.nearest_least,
         sample.largest_gap,
         sample.dropped,
+        sample.narrowest_gap,
+        *sample.gap_place,
     )
     path = _cache_file(key)
     with contextlib.suppress(OSError):

@@ -23,8 +23,9 @@ from places import VESSELS
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh, wall_sampling
 from taichi_sph.geometry.caps import find_caps
+from taichi_sph.geometry.findings import check_vessel
 from taichi_sph.geometry.interior import Interior
-from taichi_sph.geometry.vessel import Vessel, build_vessel, check_vessel, read_vessel
+from taichi_sph.geometry.vessel import Vessel, build_vessel, read_vessel
 from taichi_sph.scene import Column, OpeningTable, read_scene
 
 SCENES = sorted(path.relative_to(VESSELS).as_posix() for path in VESSELS.glob("*/scene.toml"))
