@@ -11,9 +11,10 @@ from meshes import cylinder, write_scene
 from surface_bytes import VOLUME, Mesh, ascii_stl, binary_stl, tube
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
+from taichi_sph.geometry.findings import check_vessel
 from taichi_sph.geometry.mending import largest_piece, mend
 from taichi_sph.geometry.surface_file import load_surface, require_manifold
-from taichi_sph.geometry.vessel import check_vessel, read_vessel
+from taichi_sph.geometry.vessel import read_vessel
 
 V, F = tube()
 SIZE = 40.0
