@@ -81,8 +81,9 @@ def largest_in_real_time(
     if ratio[0] < 0.0:
         return 0.0
     k = int(np.flatnonzero(ratio < 0.0)[0])
-    part = ratio[k - 1] / (ratio[k - 1] - ratio[k])
-    return float(particles[k - 1] * (particles[k] / particles[k - 1]) ** part)
+    # From the size that is too slow down to that which is not: `interp` wants ascending ratios.
+    between = np.interp(0.0, ratio[[k, k - 1]], np.log([particles[k], particles[k - 1]]))
+    return float(np.exp(between))
 
 
 def curves(

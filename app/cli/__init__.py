@@ -1,9 +1,11 @@
 """The command line: it parses, calls one function, and turns errors into one sentence."""
 
+import _thread
 import logging
 import os
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 from types import FrameType
 from typing import NoReturn
@@ -67,8 +69,27 @@ class _Terminated(BaseException):
     """SIGTERM came outside a run, which ends in its own way."""
 
 
-def _on_sigterm(*_: int | FrameType | None) -> NoReturn:
-    raise _Terminated
+AFTER_IMPORT = 0.1
+"""Wall time after which a signal that came during an import comes again [s]."""
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def on_signal(number: int, frame: FrameType | None) -> None:
+    """End the command by an exception; after an import, where Taichi would swallow it."""
+    if _is_importing(frame):
+        again = threading.Timer(AFTER_IMPORT, _thread.interrupt_main, [number])
+        again.daemon = True
+        again.start()
+        return
+    raise _Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 def one_sentence(error: OSError) -> str:
@@ -122,10 +143,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    signal.signal(signal.SIGTERM, _on_sigterm)
     log = logging.getLogger("taichi_sph")
     log.handlers, log.propagate = [Stages()], False
     log.setLevel(logging.INFO)
+    # Taichi would import them, seconds long, for arrays that nobody here hands it.
+    os.environ.setdefault("TI_ENABLE_TORCH", "0")
+    os.environ.setdefault("TI_ENABLE_PADDLE", "0")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
     message, code = invoke(arguments)
     view = sys.modules.get("app.view.rerun_view")
     leave(message, code, at_once=view is not None and view.viewer_stalled())
