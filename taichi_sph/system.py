@@ -58,7 +58,7 @@ def replaced(path: Path, growing: Path | None = None) -> Iterator[BinaryIO]:
         raise
 
 
-LOCKED_BYTE = 1 << 30
+LOCKED_BYTE = 1 << 40
 """Byte that a lock is on where locks are of bytes (Windows): nobody else may read that one."""
 
 

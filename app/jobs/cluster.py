@@ -130,7 +130,7 @@ def run_on_worker(
             death = killed
         finally:
             process.stop()
-    return None, RunError(f"{label}: {death}, {ATTEMPTS} times, on {get_worker().address}")
+    return None, ProcessError(f"{label}: {death}, {ATTEMPTS} times, on {get_worker().address}")
 
 
 # At who asks.
@@ -244,7 +244,9 @@ def _outcome(future: Any, label: str, scheduler: str) -> tuple[Any, Exception | 
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
-        return None, RunError(f"{label}: the workers that it was on have died, one after another")
+        return None, ProcessError(
+            f"{label}: the workers that it was on have died, one after another"
+        )
     if isinstance(error, ImportError):
         return None, InputError(
             f"--scheduler {scheduler}: a worker cannot import vesselflow ({error}); install "

@@ -19,7 +19,6 @@ from rich.progress import Progress as Bar
 from app.jobs.cluster import run_on_cluster
 from app.jobs.process import ATTEMPTS, POLL, Event, Process, ProcessError
 from app.progress import LINE_EVERY, duration
-from taichi_sph.errors import RunError
 from taichi_sph.system import processors
 
 JobType = TypeVar("JobType")
@@ -171,7 +170,7 @@ def run_here(
                         waiting.appendleft(number)
                         yield Event(ended, sentence=f"{jobs[number]}: {death}; trying again")
                         continue
-                    result, error = None, RunError(f"{jobs[number]}: {death}, {ATTEMPTS} times")
+                    result, error = None, ProcessError(f"{jobs[number]}: {death}, {ATTEMPTS} times")
                 ended += 1
                 yield Event(ended, number, result, error)
     finally:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from app.files import console, table, write_json
-from nn.dataset import Dataset
+from nn.dataset.reader import Dataset
 from nn.features import COUNT, NAMES
 from nn.training.train import Settings, TrainingRuns, train_weights, use_threads
 from nn.weights import CLIP, Weights

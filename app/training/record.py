@@ -1,30 +1,36 @@
 """Record runs of the physics for training: a process for each run, one file for all."""
 
 import contextlib
-import hashlib
-import multiprocessing
-import os
-import pickle
-import signal
-import subprocess
+import shutil
 import sys
+import tempfile
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
 from app import version
-from app.files import check_output
-from app.progress import Progress, duration
-from nn import dataset
-from nn.dataset import Proxies, RecordedState, RunMetadata, RunWriter
+from app.files import check_output, write_bytes
+from app.jobs.cluster import address_of
+from app.jobs.process import ProcessError, report
+from app.jobs.runner import Finished, run_jobs
+from app.progress import duration
+from nn.dataset.reader import Dataset
+from nn.dataset.schema import (
+    SIGNATURE,
+    Proxies,
+    RecordedState,
+    RunMetadata,
+    mean_acceleration,
+    require_same,
+    size_of,
+)
+from nn.dataset.writer import RunWriter, committed_states, merge
 from nn.features import COUNT, TABLE_VERSION, FeatureScales
 from nn.training.rollout import ReplaySimulation
 from taichi_sph.derived import derive
@@ -32,22 +38,25 @@ from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry.vessel import read_vessel
 from taichi_sph.runtime import start
 from taichi_sph.scene import Scene, read_scene
-
-Show = Callable[[int, int, int], None]
-"""Told a run's number, its states so far and its sub-steps so far."""
+from taichi_sph.scene_files import read_files, sha256
 
 
 @dataclass(frozen=True)
-class Task:
+class RecordingJob:
     """All that a process needs to record a run."""
 
     number: int
     scene: Scene
     """With the run's own column."""
-    facts: RunMetadata
+    metadata: RunMetadata
     part: Path
     """The run's file while it is under way."""
     threads: int | None
+    files: dict[str, bytes]
+    """Contents of what the scene names, by the name there."""
+
+    def __str__(self) -> str:
+        return f"{self.part}"
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Recording:
 
     def __str__(self) -> str:
         first = self.runs[0]
-        particles = ", ".join(str(facts.particles) for facts in self.runs)
+        particles = ", ".join(str(run.particles) for run in self.runs)
         there = f", {self.resumed} states were there already" if self.resumed else ""
         return (
             f"{self.out}: {len(self.runs)} runs of {first.frames} frames, "
@@ -104,7 +113,7 @@ def record(
         arch: cpu or gpu.
         threads: CPU threads of each process; all of them shared out by default.
         seed: of the proxies' places.
-        scheduler: "dask:ADDRESS" records on a cluster that sees the same folders.
+        scheduler: "dask:ADDRESS" records on a Dask cluster, whose workers need none of the files.
 
     Raises:
         InputError: something given is of no use; found before anything is simulated.
@@ -112,35 +121,39 @@ def record(
         OSError: the disk is full.
     """
     began = time.perf_counter()
-    check_output(out, "--out", dataset.SIGNATURE)
-    tasks = plan(scene_path, heights, frames, out, substeps, features, arch, threads, seed)
-    runs = tuple(task.facts for task in tasks)
+    check_output(out, "--out", SIGNATURE)
+    if scheduler is not None:
+        address_of(scheduler)
+    jobs = plan(scene_path, heights, frames, out, substeps, features, arch, threads, seed)
+    runs = tuple(job.metadata for job in jobs)
     if out.exists() and out.stat().st_size > 0:
         _require_recorded(out, runs)
         return Recording(out, runs, len(runs) * (frames + 1), out.stat().st_size, 0.0)
-    there = {task.number: dataset.committed_states(task.part, task.facts) for task in tasks}
-    _require_room(tasks)
-    interval = runs[0].frame_interval
-    progress = Progress(len(runs) * frames * interval, f"{tasks[0].scene.name}, {len(runs)} runs")
-    seen = {number: (states, 0) for number, states in there.items()}
-    wanted = [task for task in tasks if there[task.number] <= frames]
-
-    def show(number: int, states: int, steps: int) -> None:
-        seen[number] = states, steps
-        simulated = sum(max(0, states - 1) for states, _ in seen.values()) * interval
-        progress.show(simulated, sum(steps for _, steps in seen.values()), 0)
-
-    try:
-        if scheduler is None:
-            record_here(wanted, processes, show)
-        else:
-            record_on_cluster(wanted, scheduler, show)
-    finally:
-        progress.close()
-    with Console(file=sys.stderr).status(f"compressing into {out}"):
-        dataset.merge([task.part for task in tasks], out)
+    there = {job.number: committed_states(job.part, job.metadata) for job in jobs}
+    _require_room(jobs)
+    wanted = [job for job in jobs if there[job.number] <= frames]
+    work: Callable[[RecordingJob], bytes | None] = record_run if scheduler is None else record_apart
+    title = f"{jobs[0].scene.name}, {len(runs)} runs"
+    with contextlib.closing(run_jobs(work, wanted, processes, scheduler, title)) as ended:
+        for run in ended:
+            content = _recorded(run)
+            if content is not None:
+                write_bytes(run.job.part, content)
+    with Console(file=sys.stderr).status(f"compressing into {escape(str(out))}"):
+        merge([job.part for job in jobs], out)
     wall_time = time.perf_counter() - began
     return Recording(out, runs, sum(there.values()), out.stat().st_size, wall_time)
+
+
+def _recorded(run: Finished[RecordingJob, bytes | None]) -> bytes | None:
+    """What a run that has ended left to write here, if anything.
+
+    Raises:
+        InputError, RunError, OSError: what it ended with, or that its process was killed.
+    """
+    if isinstance(run.error, ProcessError):
+        raise RunError(f"{run.error}; the same command goes on with it")
+    return run.value()
 
 
 def plan(
@@ -153,7 +166,7 @@ def plan(
     arch: str,
     threads: int | None,
     seed: int,
-) -> list[Task]:
+) -> list[RecordingJob]:
     """What there is to do, as for `record`; every column is tried, so that none fails hours later.
 
     Raises:
@@ -169,8 +182,8 @@ def plan(
             raise InputError(f"{option} {value}: at least 1 is needed")
     scene = read_scene(scene_path)
     vessel = read_vessel(scene)
-    surface = (Path(scene.folder) / scene.vessel.surface).read_bytes()
-    tasks = []
+    contents = read_files(scene)
+    jobs = []
     for number, height in enumerate(heights):
         if not height > 0.0:
             raise InputError(f"--heights {height:g}: a height is greater than 0 m")
@@ -179,11 +192,11 @@ def plan(
         )
         blood = vessel.fill_column(column, scene.discretization.spacing)
         derived = derive(scene, vessel, len(blood), 0)
-        facts = RunMetadata(
+        metadata = RunMetadata(
             scene=scene.text,
             scene_name=scene.name,
             scene_folder=scene.folder,
-            surface_sha256=hashlib.sha256(surface).hexdigest(),
+            surface_sha256=sha256(contents[scene.vessel.surface]),
             program_version=version(),
             architecture=arch,
             seed=seed,
@@ -197,23 +210,31 @@ def plan(
             substeps=substeps,
             frame_interval=substeps * derived.step,
             feature_version=TABLE_VERSION if features else 0,
+            tool_sha256=sha256(contents[scene.tool.surface]) if scene.tool else "",
         )
         part = out.with_name(f"{out.name}.run{number}.part")
-        tasks.append(
-            Task(number, msgspec.structs.replace(scene, column=column), facts, part, threads)
+        jobs.append(
+            RecordingJob(
+                number,
+                msgspec.structs.replace(scene, column=column),
+                metadata,
+                part,
+                threads,
+                contents,
+            )
         )
-    known = {task.part for task in tasks}
+    known = {job.part for job in jobs}
     for path in sorted(out.parent.iterdir()):
         ours = path.name.startswith(f"{out.name}.run") and path.name.endswith(".part")
         if ours and path not in known:
             raise InputError(
                 f"{path}: left by a recording of more heights; delete it, or record those"
             )
-    return tasks
+    return jobs
 
 
-def _feature_count(facts: RunMetadata) -> int:
-    return COUNT if facts.feature_version else 0
+def _feature_count(metadata: RunMetadata) -> int:
+    return COUNT if metadata.feature_version else 0
 
 
 def _require_recorded(out: Path, runs: Sequence[RunMetadata]) -> None:
@@ -223,26 +244,25 @@ def _require_recorded(out: Path, runs: Sequence[RunMetadata]) -> None:
         InputError: it holds something else.
     """
     advice = "name another file, or delete it"
-    with dataset.Dataset(out) as data:
+    with Dataset(out) as data:
         if len(data.runs) != len(runs):
             raise InputError(f"--out {out}: holds {len(data.runs)} runs, not {len(runs)}; {advice}")
-        for run, facts in zip(data.runs, runs, strict=True):
-            dataset.require_same(run.facts, facts, f"--out {out}", advice)
+        for run, wanted in zip(data.runs, runs, strict=True):
+            require_same(run.facts, wanted, f"--out {out}", advice)
 
 
-def _require_room(tasks: Sequence[Task]) -> None:
+def _require_room(jobs: Sequence[RecordingJob]) -> None:
     """Refuse a recording that the disk cannot hold, before hours are spent on it.
 
     Raises:
         InputError: what is missing of the runs does not fit, uncompressed and once more.
     """
     needed = sum(
-        dataset.size_of(task.facts, _feature_count(task.facts)) * (1 if task.part.exists() else 2)
-        for task in tasks
+        size_of(job.metadata, _feature_count(job.metadata)) * (1 if job.part.exists() else 2)
+        for job in jobs
     )
-    folder = tasks[0].part.parent
-    files = os.statvfs(folder)
-    free = files.f_bavail * files.f_frsize
+    folder = jobs[0].part.parent
+    free = shutil.disk_usage(folder).free
     if needed > free:
         raise InputError(
             f"--out: {needed / 1e9:.3g} GB are needed meanwhile in {folder}, "
@@ -250,166 +270,56 @@ def _require_room(tasks: Sequence[Task]) -> None:
         )
 
 
-def record_run(task: Task, report: Callable[[int, int], None]) -> None:
-    """Record a run in this process, or go on with it; reports states and sub-steps so far.
-
-    Starts Taichi, so it needs a process of its own.
+def record_run(job: RecordingJob) -> None:
+    """Record a run, or go on with it; starts Taichi, so it needs a process of its own.
 
     Raises:
         InputError: the run's file holds something else.
         RunError: the run diverged.
         OSError: the disk is full.
     """
-    facts = task.facts
-    start(facts.architecture, "f32", task.threads, random_seed=facts.seed)
-    replay = ReplaySimulation(task.scene, read_vessel(task.scene), facts.seed)
+    metadata = job.metadata
+    start(metadata.architecture, "f32", job.threads, random_seed=metadata.seed)
+    replay = ReplaySimulation(job.scene, read_vessel(job.scene), metadata.seed)
     scales = FeatureScales(
-        facts.support_radius, facts.spacing, facts.frame_interval, facts.sound_speed,
-        task.scene.discretization.wall_spacing_ratio,
+        metadata.support_radius, metadata.spacing, metadata.frame_interval, metadata.sound_speed,
+        job.scene.discretization.wall_spacing_ratio,
     )  # fmt: skip
     wall = replay.simulation.wall
     proxies = Proxies(*(f.to_numpy() for f in (wall.position, wall.normal, wall.volume)))
-    with RunWriter(task.part, facts, proxies, _feature_count(facts)) as writer:
-        there = writer.committed
+    count = _feature_count(metadata)
+    with RunWriter(job.part, metadata, proxies, job.files, count) as writer:
+        there = writer.states
         before: RecordedState | None = None
         if there:
             before = writer.state(there - 1)
-            replay.restore(before, (there - 1) * facts.frame_interval, writer.steps())
+            replay.restore(before, (there - 1) * metadata.frame_interval, writer.steps())
         else:
             replay.settle()
-        report(there, replay.simulation.steps)
-        for frame in range(there, facts.frames + 1):
+        for frame in range(there, metadata.frames + 1):
             if frame:
-                replay.advance_to(frame * facts.frame_interval)
+                replay.advance_to(frame * metadata.frame_interval)
                 replay.settle()
             now = replay.state()
             acceleration = np.zeros_like(now.velocity)
             if before is not None:
-                acceleration = dataset.mean_acceleration(
-                    before.velocity, now.velocity, now.alive, facts.frame_interval
+                acceleration = mean_acceleration(
+                    before.velocity, now.velocity, now.alive, metadata.frame_interval
                 )
             found = None
-            if facts.feature_version and frame < facts.frames:
+            if metadata.feature_version and frame < metadata.frames:
                 replay.set_acceleration(acceleration)
                 found = replay.features(scales)[:, :COUNT]
             writer.append(now, acceleration, found, replay.substeps())
             before = now
-            report(frame + 1, replay.simulation.steps)
+            report((frame + 1 - there) / (metadata.frames + 1 - there))
 
 
-def work(task: Task, parent: Connection) -> None:
-    """A process that records a run: reports, or the error it ended with, go to `parent`."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    with contextlib.suppress(BrokenPipeError):  # the parent is gone: so are we
-        try:
-            record_run(task, lambda states, steps: parent.send((states, steps)))
-        except BrokenPipeError:
-            raise
-        except (InputError, RunError, OSError) as error:
-            parent.send(error)
-
-
-def record_here(
-    tasks: Sequence[Task],
-    processes: int,
-    show: Show,
-    target: Callable[[Task, Connection], None] = work,
-) -> None:
-    """Record runs, each in a process of its own, a number of them at once.
-
-    Raises:
-        InputError, RunError, OSError: what a run ended with, or that its process was killed.
-    """
-    context = multiprocessing.get_context("spawn")
-    shared = max(1, (os.cpu_count() or 1) // max(1, min(processes, len(tasks))))
-    waiting = deque(tasks)
-    running: dict[Any, tuple[Any, Task]] = {}
-    try:
-        while waiting or running:
-            while waiting and len(running) < processes:
-                task = waiting.popleft()
-                if task.threads is None:
-                    task = Task(task.number, task.scene, task.facts, task.part, shared)
-                ours, theirs = context.Pipe(duplex=False)
-                process = context.Process(target=target, args=(task, theirs), daemon=True)
-                process.start()
-                theirs.close()
-                running[ours] = process, task
-            ready: list[Any] = wait(list(running))
-            for connection in ready:
-                process, task = running[connection]
-                try:
-                    message = connection.recv()
-                except EOFError:
-                    process.join()
-                    del running[connection]
-                    if process.exitcode:
-                        raise RunError(
-                            f"{task.part}: the process that recorded it ended with exit code "
-                            f"{process.exitcode}; the same command goes on with it"
-                        ) from None
-                    continue
-                if isinstance(message, Exception):
-                    raise message
-                show(task.number, *message)
-    finally:
-        for process, _ in running.values():
-            process.terminate()
-            process.join()
-
-
-def record_on_cluster(tasks: Sequence[Task], scheduler: str, show: Show) -> None:
-    """Record runs on the workers of a Dask cluster that see the same folders.
-
-    Raises:
-        InputError: the scheduler cannot be used; else as `record_here`.
-    """
-    kind, _, address = scheduler.partition(":")
-    if kind != "dask" or not address:
-        raise InputError(f"--scheduler {scheduler}: allowed is dask:ADDRESS")
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise InputError(
-            f"--scheduler {scheduler}: needs Dask; install it with: pip install distributed"
-        ) from None
-    try:
-        client = Client(address, timeout=20)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {scheduler}: no answer ({type(error).__name__})") from None
-    with client:
-        for future in as_completed(client.map(record_apart, tasks, pure=False)):
-            show(*future.result())
-
-
-def record_apart(task: Task) -> tuple[int, int, int]:
-    """Record a run in a process of its own, from anywhere; returns number, states, sub-steps.
-
-    Dask's workers are daemons with threads: they may not use multiprocessing, nor start Taichi.
-    """
-    program = "from app.training.record import serve; serve()"
-    done = subprocess.run(
-        [sys.executable, "-c", program], input=pickle.dumps(task), capture_output=True, check=False
-    )
-    if done.returncode:
-        raise RunError(f"{task.part}: {done.stderr.decode(errors='replace').strip()[-2000:]}")
-    answer = pickle.loads(done.stdout)
-    if isinstance(answer, Exception):
-        raise answer
-    return task.number, *answer
-
-
-def serve() -> None:
-    """Record the run given on standard input; the last report, or the error, goes to output."""
-    task = pickle.load(sys.stdin.buffer)
-    answer: tuple[int, int] | Exception = (0, 0)
-
-    def report(states: int, steps: int) -> None:
-        nonlocal answer
-        answer = states, steps
-
-    try:
-        record_run(task, report)
-    except (InputError, RunError, OSError) as error:
-        answer = error
-    sys.stdout.buffer.write(pickle.dumps(answer))
+def record_apart(job: RecordingJob) -> bytes:
+    """Record a run on another machine, or go on with what came along; the content of its file."""
+    with tempfile.TemporaryDirectory() as folder:
+        part = Path(folder) / "part"
+        if job.part.is_file():
+            shutil.copyfile(job.part, part)
+        record_run(replace(job, part=part))
+        return part.read_bytes()

@@ -48,7 +48,7 @@ def train(
     curves = out.with_suffix(".history.json")
     check_output(curves, "--out", b"{")
 
-    from nn.dataset import Dataset
+    from nn.dataset.reader import Dataset
     from nn.training.train import TrainingRuns, train_weights, use_threads
     from taichi_sph.runtime import start
 

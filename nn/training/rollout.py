@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from nn.dataset import RecordedState, Substeps
+from nn.dataset.schema import RecordedState, Substeps
 from nn.features import GATHERED, FeatureScales, extract
 from taichi_sph.errors import InputError
 from taichi_sph.fluid.wcsph import Fluid, SphAcceleration, sum_density

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from nn.dataset import Dataset, Run, mean_acceleration
+from nn.dataset.reader import Dataset, Run
+from nn.dataset.schema import mean_acceleration
 from nn.features import COUNT, NAMES, FeatureScales
 from nn.pcnet import LARGEST_EXPONENT, PcNet, largest_factors, make_pcnet
 from nn.training.rollout import ReplaySimulation

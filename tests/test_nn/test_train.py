@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch", reason="torch is an extra: pip install 'ves
 from app.scenes.library import find_scene  # noqa: E402
 from app.training.compare_networks import persistence, ridge  # noqa: E402
 from builders import vesselflow  # noqa: E402
-from nn.dataset import Dataset  # noqa: E402
+from nn.dataset.reader import Dataset  # noqa: E402
 from nn.features import COUNT, FeatureScales  # noqa: E402
 from nn.pcnet import DirectPcNet, make_pcnet  # noqa: E402
 from nn.training.rollout import ReplaySimulation  # noqa: E402

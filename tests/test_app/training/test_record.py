@@ -1,11 +1,12 @@
 import os
 import shutil
 import signal
+import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from app.jobs.process import in_own_process
 from app.scenes.library import vessels_folder
-from app.training.record import (
-    Recording,
-    Task,
-    plan,
-    record,
-    record_apart,
-    record_here,
-    record_run,
-)
-from nn import dataset
-from nn.dataset import Dataset, RecordedState, check
+from app.training.record import Recording, RecordingJob, plan, record, record_run
+from cluster import cluster, wait_for
+from nn.dataset.reader import Dataset, check
+from nn.dataset.schema import RecordedState
+from nn.dataset.writer import RunWriter, committed_states
 from nn.training.rollout import ReplaySimulation
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry.vessel import read_vessel
@@ -110,37 +106,77 @@ def test_a_state_says_all_that_its_future_needs(scene_file: Path) -> None:
                 np.testing.assert_array_equal(found, expected, f"{name} {first} {frame}")
 
 
-def die_under_way(task: Task, parent: Connection) -> None:
-    """Record until some states are committed, then end as by kill -9."""
-    dataset.COMMIT_EVERY = 0.0
+def die_under_way(job: RecordingJob) -> None:
+    """Record until some states are written, then end as by kill -9."""
+    append = RunWriter.append
 
-    def report(states: int, steps: int) -> None:
-        if states == KILLED_AFTER:
+    def append_or_die(writer: RunWriter, *state: Any) -> None:
+        append(writer, *state)
+        if writer.states == KILLED_AFTER:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    record_run(task, report)
+    RunWriter.append = append_or_die  # type: ignore[method-assign, assignment]
+    record_run(job)
 
 
-def test_killed_or_not_here_or_apart_the_file_is_the_same_to_the_bit(
-    recorded: Recording, scene_file: Path, make: Maker, tmp_path: Path
+@pytest.fixture(scope="module")
+def begun(scene_file: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """What a killed recording leaves of the first run."""
+    out = tmp_path_factory.mktemp("begun") / "data.h5"
+    job = plan(scene_file, HEIGHTS[:1], FRAMES, out, SUBSTEPS, True, "cpu", 2, 0)[0]
+    with pytest.raises(RunError, match="its process was ended by SIGKILL"):
+        in_own_process(die_under_way, job)
+    assert committed_states(job.part, job.metadata) == KILLED_AFTER
+    return job.part.read_bytes()
+
+
+def test_killed_or_not_the_file_is_the_same_to_the_bit(
+    recorded: Recording, begun: bytes, make: Maker, tmp_path: Path
 ) -> None:
     out = tmp_path / "data.h5"
-    tasks = plan(scene_file, HEIGHTS, FRAMES, out, SUBSTEPS, True, "cpu", 2, 0)
-    with pytest.raises(RunError, match="exit code -9; the same command goes on with it"):
-        record_here(tasks[:1], 1, lambda *_: None, die_under_way)
-    assert dataset.committed_states(tasks[0].part, tasks[0].facts) == KILLED_AFTER
-    # As a worker of a cluster does it.
-    assert record_apart(tasks[1])[:2] == (1, FRAMES + 1)
+    (tmp_path / "data.h5.run0.part").write_bytes(begun)
     with pytest.raises(InputError, match=r"holds a run of frames 10, asked for is 11"):
         make(HEIGHTS, FRAMES + 1, out)
-    with pytest.raises(InputError, match=r"run1\.part: left by a recording of more heights"):
-        make(HEIGHTS[:1], FRAMES, out)
+    with pytest.raises(InputError, match=r"run0\.part: holds a run of height 0\.004, asked for is"):
+        make(HEIGHTS[1:], FRAMES, out)
+    (tmp_path / "data.h5.run7.part").write_bytes(b"")
+    with pytest.raises(InputError, match=r"run7\.part: left by a recording of more heights"):
+        make(HEIGHTS, FRAMES, out)
+    (tmp_path / "data.h5.run7.part").unlink()
     assert not out.exists()
 
     again = make(HEIGHTS, FRAMES, out, processes=1)
-    assert again.resumed == KILLED_AFTER + FRAMES + 1
+    assert again.resumed == KILLED_AFTER
     assert out.read_bytes() == recorded.out.read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["data.h5"]
+
+
+def has_children(process: int) -> bool:
+    return any(file.read_text() for file in Path(f"/proc/{process}/task").glob("*/children"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_a_cluster_records_the_same_bits_and_bears_the_loss_of_a_worker(
+    recorded: Recording, begun: bytes, make: Maker, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed", reason="an extra: pip install 'vesselflow[cluster]'")
+    out = tmp_path / "data.h5"
+    # A run that was begun here goes on there.
+    (tmp_path / "data.h5.run0.part").write_bytes(begun)
+    killed: list[subprocess.Popen] = []
+
+    def kill_one(workers: list[subprocess.Popen]) -> None:
+        wait_for(lambda: any(has_children(worker.pid) for worker in workers))
+        killed.append(next(worker for worker in workers if has_children(worker.pid)))
+        killed[0].kill()
+
+    (tmp_path / "cluster").mkdir()
+    with cluster(tmp_path / "cluster") as running:
+        threading.Thread(target=kill_one, args=(running.workers,), daemon=True).start()
+        again = make(HEIGHTS, FRAMES, out, threads=1, scheduler=running.address)
+        assert killed[0].wait(5.0) == -signal.SIGKILL
+    assert again.resumed == KILLED_AFTER
+    assert out.read_bytes() == recorded.out.read_bytes()
 
 
 def test_a_recording_keeps_the_promises_of_the_schema(recorded: Recording) -> None:
@@ -266,18 +302,44 @@ def test_a_file_of_another_kind_is_not_written_over(make: Maker, tmp_path: Path)
     assert out.read_text() == "mine"
 
 
-def fail(task: Task, parent: Connection) -> None:
+def diverge(job: RecordingJob) -> None:
     """End as a diverged run does."""
-    parent.send((3, 12))
-    parent.send(RunError("the run diverged: particle 3 is not finite"))
+    raise RunError("the run diverged: particle 3 is not finite")
 
 
 def test_a_diverged_run_ends_the_recording_with_its_sentence(
-    scene_file: Path, tmp_path: Path
+    make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "data.h5"
-    tasks = plan(scene_file, HEIGHTS[:1], FRAMES, out, 4, False, "cpu", 1, 0)
-    seen = []
-    with pytest.raises(RunError, match="the run diverged: particle 3 is not finite"):
-        record_here(tasks, 1, lambda *told: seen.append(told), fail)
-    assert seen == [(0, 3, 12)]
+    monkeypatch.setattr("app.training.record.record_run", diverge)
+    with pytest.raises(RunError, match=r"^the run diverged: particle 3 is not finite$"):
+        make(HEIGHTS, FRAMES, tmp_path / "data.h5")
+    assert not (tmp_path / "data.h5").exists()
+
+
+def kill_itself(job: RecordingJob) -> None:
+    """End as where memory has run out."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_recording_that_is_killed_again_and_again_says_how_it_goes_on(
+    make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.training.record.record_run", kill_itself)
+    with pytest.raises(RunError, match=r"run0\.part: its process was ended by SIGKILL, 3 times; "):
+        make(HEIGHTS[:1], FRAMES, tmp_path / "data.h5")
+
+
+def test_a_moved_folder_is_still_the_same_run(
+    recorded: Recording, scene_file: Path, tmp_path: Path
+) -> None:
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(scene_file.parent, moved)
+    shutil.copy(recorded.out, moved / "data.h5")
+    again = record(
+        moved / "scene.toml", HEIGHTS, FRAMES, moved / "data.h5", SUBSTEPS, features=True
+    )
+    assert again.resumed == 2 * (FRAMES + 1)
+    surface = moved / "lumen.ply"
+    surface.write_bytes(surface.read_bytes().replace(b"lumen of", b"LUMEN of", 1))
+    with pytest.raises(InputError, match="holds a run of another surface_sha256"):
+        record(moved / "scene.toml", HEIGHTS, FRAMES, moved / "data.h5", SUBSTEPS, features=True)
