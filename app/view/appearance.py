@@ -95,14 +95,3 @@ def eye(vertices: Floats, up: Floats) -> tuple[Floats, Floats]:
     )
     target = middle + shift
     return target + 1.1 * distance * back, target
-
-
-def vertex_normals(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
-    """Unit normals of vertices, area-weighted means of their triangles', shape (n, 3)."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    of_faces = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], of_faces)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.maximum(length, np.finfo(float).tiny)
