@@ -1,25 +1,28 @@
 """One run from its options to its outputs: `vesselflow run` without a command line."""
 
 import contextlib
-import importlib.util
 import os
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app import version
 from app.run.options import DEFAULT_ERROR, RunOptions
 from app.scenes.driving import driving
 from app.scenes.library import find_scene, weights_for, with_column
-from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
 from taichi_sph.scene_files import file_hash, scene_files
 
 if TYPE_CHECKING:
+    from app.control.ports import Ports
     from app.control.session import Session
     from app.run.checkpoint import Checkpoint
     from app.run.loop import Outcome
     from taichi_sph.simulation import ModelFactory, Simulation
+
+TOKEN = "VESSELFLOW_TOKEN"
+"""Environment variable with what the channel's clients have to know."""
 
 
 def run_scene(options: RunOptions) -> "Outcome":
@@ -36,12 +39,41 @@ def run_scene(options: RunOptions) -> "Outcome":
 
     scene = with_column(find_scene(options.scene), options.particles, options.height)
     # Once: what is free now is not when the log has been begun.
-    options = replace(options, session=options.session_file(scene))
-    with claimed_outputs(options, scene):
-        require_ports(options)
-        outcome = _drive(options, _Start.of(options, scene))
+    options = replace(options, session=_session_file(options, scene))
+    with contextlib.ExitStack() as ports, claimed_outputs(options, scene):
+        controls = bind_controls(options, ports)
+        outcome = _drive(options, _Start.of(options, scene), controls)
         report(outcome, options)
     return outcome
+
+
+def _session_file(options: RunOptions, scene: Scene) -> Path | None:
+    """File of the log: what a run that goes on has begun, or as the options say."""
+    if options.resume is not None and options.control is not None and options.session is None:
+        from app.control.log import log_of
+        from app.run.checkpoint import Checkpoint
+
+        begun = log_of(Checkpoint.read(options.resume), scene.name)
+        if begun is not None:
+            return begun
+    return options.session_file(scene)
+
+
+def bind_controls(options: RunOptions, ports: contextlib.ExitStack) -> "Ports | None":
+    """Bind the ports of page and channel, and see that of the live view free.
+
+    Raises:
+        InputError: a port is taken, or the host asks for a token.
+    """
+    from app.control.ports import PAGE_HOST, bind_ports, listen
+
+    if options.live is not None:
+        listen(PAGE_HOST, options.live, "--live").close()
+    if options.control is None:
+        return None
+    bound = bind_ports(options.control, options.host, os.environ.get(TOKEN))
+    ports.callback(bound.close)
+    return bound
 
 
 @dataclass(frozen=True)
@@ -100,7 +132,7 @@ def facts_of(options: RunOptions, scene: Scene) -> dict[str, Any]:
     return facts
 
 
-def _drive(options: RunOptions, run: _Start) -> "Outcome":
+def _drive(options: RunOptions, run: _Start, ports: "Ports | None") -> "Outcome":
     """Simulate, with all that looks on and acts."""
     from app.progress import Progress
     from app.run.loop import drive
@@ -115,13 +147,20 @@ def _drive(options: RunOptions, run: _Start) -> "Outcome":
     session = _open_session(simulation, options, run) if options.is_acted_on else None
     if session is None and run.begun is not None:
         simulation.load_state(run.begun.state)
-    observers = observers_of(simulation, options, run.facts)
-    if session is not None and "view" in observers:
-        session.notes.append(observers["view"].note)  # type: ignore[attr-defined]
     end = options.end(run.scene)
-    with contextlib.ExitStack() as doors:
-        if session is not None and options.control is not None:
-            open_doors(session, options.control, options.host, doors)
+    with contextlib.ExitStack() as servers:
+        addresses: list[str] = []
+        if session is not None and ports is not None:
+            from app.control.serve import serve_controls
+
+            serving = serve_controls(session, ports, os.environ.get(TOKEN))
+            addresses = servers.enter_context(serving)
+        # Last, for it replaces a recording.
+        observers = observers_of(simulation, options, run.facts)
+        if session is not None and "view" in observers:
+            session.on_applied.append(observers["view"].note)  # type: ignore[attr-defined]
+        for line in addresses:
+            print(line, file=sys.stderr)
         return drive(
             simulation,
             [*([session] if session else []), *observers.values()],
@@ -134,54 +173,10 @@ def _drive(options: RunOptions, run: _Start) -> "Outcome":
 
 
 def _open_session(simulation: "Simulation", options: RunOptions, run: _Start) -> "Session":
-    from app.control.session import open_session
+    from app.control.session import start_session
 
-    return open_session(
-        simulation, options.weights, options.script, options.session, run.begun,
-        run.facts | {"checkpoint": options.checkpoint}, options.control is not None,
+    return start_session(
+        simulation, run.facts | {"checkpoint": options.checkpoint}, log=options.session,
+        script=options.script, weights=options.weights, checkpoint=run.begun,
+        all_models=options.control is not None,
     )  # fmt: skip
-
-
-def require_ports(options: RunOptions) -> None:
-    """Refuse ports that are taken before a file is touched.
-
-    Raises:
-        InputError: a port is taken, or the host asks for a token.
-    """
-    from app.control.channel import is_loopback, listen
-
-    wanted = [("--live", "127.0.0.1", options.live)] if options.live is not None else []
-    if options.control is not None:
-        wanted.append(("page", "127.0.0.1", options.control))
-        wanted.append(("channel", options.host, options.control + 1))
-    for what, host, port in wanted:
-        with contextlib.closing(listen(host, port, what)) as listener:
-            if not is_loopback(listener) and not os.environ.get("VESSELFLOW_TOKEN"):
-                raise InputError(
-                    f"--host {host}: other machines reach this address; put a token that clients "
-                    "have to know into VESSELFLOW_TOKEN, or serve at 127.0.0.1"
-                )
-
-
-def open_doors(session: "Session", port: int, host: str, doors: contextlib.ExitStack) -> None:
-    """Serve the page at a port and the channel at the next, until `doors` are closed.
-
-    Raises:
-        InputError: a port is taken, or the host asks for a token.
-    """
-    from app.control.channel import Channel
-    from app.control.page import ControlPage
-
-    channel = Channel(session, host, port + 1, os.environ.get("VESSELFLOW_TOKEN"))
-    doors.callback(channel.close)
-    print(f"commands as JSON lines: {host}:{port + 1}", file=sys.stderr)
-    try:
-        page = ControlPage(session, port=port)
-    except InputError as problem:
-        if importlib.util.find_spec("viser") is not None:
-            raise
-        print(problem, file=sys.stderr)
-        return
-    doors.callback(page.close)
-    session.refusals.append(page.tell)
-    print(f"page: {page.url}", file=sys.stderr)

@@ -59,7 +59,7 @@ WITHOUT_TAICHI = ("taichi_sph.errors", "taichi_sph.system", "taichi_sph.scene",
                   "taichi_sph.geometry")  # fmt: skip
 
 ONLY_IN = {
-    "rerun": ("app.view.rerun_view",),
+    "rerun": ("app.view.rerun_view", "app.view.rerun_streams"),
     "torch": ("nn.training.train",),
     "click": ("app.cli",),
     "viser": ("app.control.page",),

@@ -15,8 +15,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from rich.table import Table
 
+from app.control.auto_model import ModelSelection
 from app.control.channel import Channel
+from app.control.log import LogWriter
 from app.control.page import ControlPage
+from app.control.ports import listen
 from app.control.session import Session
 from app.files import table
 from app.models import model_factory
@@ -74,20 +77,25 @@ def measure_overhead(
     """
     start(arch, "f32", threads)
     simulation = Simulation.from_scene(scene, model_factory("pcnet", scene, weights))
-    session = Session(simulation, {}, folder / "session.jsonl")
+    log = LogWriter(folder / "session.jsonl", {}, simulation.particles.names)
+    session = Session(simulation, ModelSelection(simulation), log)
     view = RerunView(simulation, None, _free_port())
     sides: dict[bool, list[float]] = {False: [], True: []}
     frame_times, pictures, latency, frame = [], 0, 0.0, 0
     spawn = multiprocessing.get_context("spawn")
     acting, done = spawn.Event(), spawn.Event()
-    with closing(Channel(session)) as channel, closing(ControlPage(session, port=0)) as page:
+    channel_port, page_port = (listen("127.0.0.1", 0, "bench") for _ in range(2))
+    with (
+        closing(Channel(session, channel_port)) as channel,
+        closing(ControlPage(session, page_port)) as page,
+    ):
         place = [float(x) for x in simulation.tool.position]
         client = spawn.Process(
             target=_act, args=(channel.port, page.port, place, acting, done), daemon=True
         )
         client.start()
         end = time.monotonic() + _PATIENCE
-        while not session.watched:
+        while not session.frame_requested:
             if time.monotonic() > end or not client.is_alive():
                 raise RuntimeError("bench --control: its own client does not reach the page")
             time.sleep(0.1)
@@ -97,14 +105,14 @@ def measure_overhead(
             for acted in (False, True) if pair % 2 else (True, False):
                 # Both do the same work: a tool without a shape moves no blood.
                 simulation.load_state(state)
-                sent, steps, began = page.pictures, simulation.steps, time.perf_counter()
+                sent, steps, began = page.frames_shown, simulation.steps, time.perf_counter()
                 if acted:
                     session.before_step()
                     session.latency = 0.0  # what came too late for the last stretch waited long
                     acting.set()
                 else:
                     acting.clear()
-                    session.watched = False
+                    session.frame_requested = False
                 for _ in range(FRAMES):
                     frame += 1
                     simulation.advance_to(
@@ -122,7 +130,7 @@ def measure_overhead(
                 if acted:
                     frame_times.append(took / FRAMES)
                     latency = max(latency, session.latency)
-                    pictures += page.pictures - sent
+                    pictures += page.frames_shown - sent
         done.set()
         acting.set()
         client.join()

@@ -14,6 +14,7 @@ import click
 
 from app import version
 from app.cli import measure, run, scenes, studies, training
+from app.cli.ending import leave
 from taichi_sph.errors import InputError, RunError
 
 EPILOG = (
@@ -123,17 +124,6 @@ def invoke(arguments: Sequence[str] | None) -> tuple[str, int]:
         return "stopped by SIGTERM", 143
 
 
-def leave(message: str, code: int, at_once: bool = False) -> NoReturn:
-    """End the process; at once, if libraries would wait for somebody else at Python's exit."""
-    if message:
-        click.echo(message, err=True)
-    if at_once:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)
-
-
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """The command `vesselflow`."""
     # Before Taichi's import: no banner, and no question to its server for a newer version.
@@ -151,6 +141,4 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     os.environ.setdefault("TI_ENABLE_PADDLE", "0")
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    message, code = invoke(arguments)
-    view = sys.modules.get("app.view.rerun_view")
-    leave(message, code, at_once=view is not None and view.viewer_stalled())
+    leave(*invoke(arguments))

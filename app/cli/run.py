@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from app.cli import options
+from app.cli.ending import leave
 from app.cli.options import output_path
 from app.models import MODELS
 from taichi_sph.errors import RunError
@@ -137,9 +138,11 @@ def run(**given: Any) -> int:
     from app.run_scene import run_scene
 
     outcome = run_scene(RunOptions(**given))
+    if outcome.stalled:
+        leave(str(outcome.error or ""), outcome.exit_code, at_once=True)
     if outcome.error is not None:
         raise outcome.error
-    return 128 + outcome.signal if outcome.signal is not None else 0
+    return outcome.exit_code
 
 
 @click.command()
@@ -153,15 +156,16 @@ def run(**given: Any) -> int:
 @options.threads
 def replay(session: Path, rrd: Path | None, threads: int | None) -> int:
     """Run a session again from its log, and compare the blood bit by bit, frame by frame."""
-    from app.control.session import run_again
+    from app.control.replay import replay as replay_session
     from app.files import check_output
     from app.locks import claimed
 
     if rrd is not None:
         check_output(rrd, "--rrd", b"RRF2")
     with claimed(rrd, "--rrd"):
-        kept, compared, difference = run_again(session, rrd, threads)
-    if difference is not None:
-        raise RunError(f"replay {session}: differs from frame {difference} on")
-    click.echo(f"{session}: {compared} frames, {len(kept.entries)} commands, the same bit by bit")
+        result = replay_session(session, rrd, threads)
+    if result.first_difference is not None:
+        raise RunError(f"replay {session}: differs from frame {result.first_difference} on")
+    commands = len(result.log.entries)
+    click.echo(f"{session}: {result.compared} frames, {commands} commands, the same bit by bit")
     return 0

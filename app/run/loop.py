@@ -25,8 +25,12 @@ class Observer(Protocol):
     def on_frame(self, simulation: "Simulation", frame: int, figures: "Diagnostics") -> None:
         """Take what is wanted of this frame; copies, for the state moves on."""
 
-    def close(self, ending: str) -> None:
-        """Finish the output; `ending` is a sentence about how the run ended."""
+    def close(self, ending: str) -> bool | None:
+        """Finish the output; `ending` is a sentence about how the run ended.
+
+        Returns:
+            True if it would hold up Python's exit: a viewer that does not answer does.
+        """
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,15 @@ class Outcome:
     summary: Summary
     error: RunError | OSError | None = None
     signal: int | None = None
+    stalled: tuple[Observer, ...] = ()
+    """Observers that would hold up Python's exit."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 done, 1 diverged, 2 an output that cannot be written, 128 + the signal."""
+        if self.error is not None:
+            return 1 if isinstance(self.error, RunError) else 2
+        return 128 + self.signal if self.signal else 0
 
     @property
     def as_json(self) -> dict[str, Any]:
@@ -205,9 +218,11 @@ def drive(
         finally:
             if progress:
                 progress.close()
+        stalled = []
         for observer in observers:
             try:
-                observer.close(ending)
+                if observer.close(ending):
+                    stalled.append(observer)
             except OSError as caught:
                 if error is None:
                     error, ending = caught, str(caught)
@@ -219,7 +234,7 @@ def drive(
         most_leaks=most_leaks, most_compression_p99=most_compression,
         diverged=isinstance(error, RunError), ending=ending,
     )  # fmt: skip
-    return Outcome(summary, error, stopped)
+    return Outcome(summary, error, stopped, tuple(stalled))
 
 
 def _summary_of(

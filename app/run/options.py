@@ -105,14 +105,12 @@ class RunOptions:
     def session_file(self, scene: Scene) -> Path | None:
         """File of the log, if one is kept.
 
-        Without a name it is the first that is free, for a log is never replaced; a run that goes
-        on does so in the last.
+        Without a name it is the first that is free, for a log is never replaced.
         """
         if self.session is not None or self.control is None:
             return self.session
         file, number = Path(f"{scene.name}.session.jsonl"), 1
-        last = file
         while file.exists() and file.stat().st_size:
             number += 1
-            last, file = file, Path(f"{scene.name}.{number}.session.jsonl")
-        return last if self.resume is not None else file
+            file = Path(f"{scene.name}.{number}.session.jsonl")
+        return file

@@ -1,22 +1,13 @@
-"""RerunView: a run as a Rerun recording, as a live view, or both; the only import of rerun.
+"""RerunView: a run as a Rerun recording, as a live view, or both.
 
 File and live view are two streams.  Rerun blocks a stream whose viewer has stalled, so the live
 one has a thread and a short queue that drops frames, and nothing waits for it.  The file has all.
 """
 
-import errno
-import os
-import queue
-import select
-import socket
-import threading
-import time
+import hashlib
 import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-# What goes wrong is said by this program, in a sentence.
-os.environ.setdefault("RUST_LOG", "off")
 
 import numpy as np
 import pyarrow as pa
@@ -36,6 +27,15 @@ from app.view.appearance import (
     speed_levels,
     upward,
 )
+from app.view.rerun_streams import (
+    DISK_TIMEOUT,
+    FILE_TICK,
+    FileWriter,
+    Items,
+    LiveView,
+    open_stream,
+    send,
+)
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import vertex_normals
 
@@ -43,21 +43,6 @@ if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics
     from taichi_sph.simulation import Simulation
 
-APPLICATION = "vesselflow"
-LIVE_MEMORY = "64MiB"
-"""What the server keeps of the past for viewers that come late; it takes twice that."""
-_BATCH = 64 << 20
-"""Bytes of a batch: with the default small rows starve beside large ones."""
-_FILE_TICK = 2.0
-"""A write follows the last by this or twice this [s]; Rerun remembers 10 kB of each for the end."""
-_LIVE_TICK = 0.02
-"""Between two messages to viewers [s]."""
-_TIMEOUT = 60.0
-"""Longest wait for the disk, at a checkpoint and at the end [s]."""
-_LIVE_TIMEOUT = 2.0
-"""Longest wait for a viewer at the end [s]."""
-_LIVE_QUEUE = 4
-"""Frames that wait for a viewer before frames are dropped."""
 _SHOWN_SECONDS = 10.0
 """How long a recording plays when it is opened [s]."""
 _LABEL_DISTANCE = 0.4
@@ -66,7 +51,7 @@ _NO_LABELS = 12
 """From this many openings on, their names would hide the vessel."""
 
 Line = tuple[str, str, tuple[int, int, int]]
-"""Of a plot: its figure, its name and its colour."""
+"""A line of a plot: its figure, its name and its colour."""
 
 PLOTS: tuple[tuple[str, tuple[Line, ...]], ...] = (
     ("largest speed [m/s]", (("max_speed", "largest speed", (255, 170, 77)),)),
@@ -105,128 +90,6 @@ PLOTS: tuple[tuple[str, tuple[Line, ...]], ...] = (
 remembers a kilobyte for the end of the file."""
 _FIGURES = pa.struct([(figure, pa.float64()) for _, lines in PLOTS for figure, *_ in lines])
 
-Items = list[tuple[str, Any]]
-
-_stalled: "list[LiveView]" = []
-
-
-def viewer_stalled() -> bool:
-    """Whether a viewer has stalled: Rerun would wait half a minute for it at Python's exit."""
-    return bool(_stalled)
-
-
-class FileWriter:
-    """Bytes of a recording on their way to a file.
-
-    Rerun's own file writer dies silently on a full disk, and closing it then hangs.  Given a pipe
-    it sees no error: this thread empties the pipe, writes the file and keeps what went wrong.
-    """
-
-    def __init__(self, path: Path):
-        """Open the file.
-
-        Raises:
-            InputError: it cannot be opened.
-        """
-        self.path = path
-        self.error: OSError | None = None
-        try:
-            self._file = open(path, "wb", buffering=0)  # noqa: SIM115
-        except OSError as error:
-            raise InputError(f"--rrd {path}: cannot be written: {error.strerror}") from None
-        self._pumping = threading.Lock()
-        self._source, self._sink = os.pipe()
-        self.sink_path = f"/dev/fd/{self._sink}"
-        self._thread = threading.Thread(target=self._pump, daemon=True, name="recording")
-        self._thread.start()
-
-    def opened(self) -> None:
-        """Rerun has opened the pipe: it alone holds the writing end now."""
-        os.close(self._sink)
-
-    def _pump(self) -> None:
-        data = b"all"
-        while data:
-            self._waits(None)
-            with self._pumping:
-                data = os.read(self._source, 1 << 20)
-                rest = memoryview(data)
-                try:
-                    while rest and not self.error:
-                        rest = rest[self._file.write(rest) :]
-                except OSError as error:
-                    self.error = error
-        try:
-            # Some file systems tell of a full disk only now; a device cannot be synchronised.
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-                self.error = self.error or error
-        finally:
-            os.close(self._source)
-            self._file.close()
-
-    def _waits(self, patience: int | None) -> bool:
-        """Whether bytes are in the pipe, or come before so long [ms], or it is closed."""
-        asked = select.poll()
-        asked.register(self._source, select.POLLIN)
-        return bool(asked.poll(patience))
-
-    def empty(self) -> None:
-        """Wait until the pipe is empty and what was in it is in the file, or cannot be.
-
-        Raises:
-            OSError: the disk does not answer.
-        """
-        end = time.monotonic() + _TIMEOUT
-        while self._thread.is_alive() and not self.error:
-            if self._pumping.acquire(timeout=_TIMEOUT):
-                waiting = self._waits(0)
-                self._pumping.release()
-                if not waiting:
-                    return
-            if time.monotonic() > end:
-                raise self.silent
-            time.sleep(1e-3)
-
-    @property
-    def silent(self) -> OSError:
-        """What is said of a disk that does not answer."""
-        return OSError(f"{self.path}: the disk has not answered for {_TIMEOUT:g} s")
-
-    def check(self) -> None:
-        """Raise what went wrong, if anything.
-
-        Raises:
-            OSError: the disk is full, or fails.
-        """
-        if self.error:
-            raise OSError(
-                f"{self.path}: the recording cannot be written: {self.error.strerror}; "
-                "what is in it so far can be rescued with `rerun rrd optimize --continue-on-error`"
-            )
-
-    def close(self) -> None:
-        """Wait for the last byte, after rerun has closed the pipe.
-
-        Raises:
-            OSError: as `check`, or the disk does not answer.
-        """
-        self._thread.join(_TIMEOUT)
-        if self._thread.is_alive():
-            raise self.silent
-        self.check()
-
-
-def _stream(identity: str, tick: float) -> rr.RecordingStream:
-    stream = rr.RecordingStream(
-        APPLICATION,
-        recording_id=identity,
-        batcher_config=rr.ChunkBatcherConfig(flush_num_bytes=_BATCH, flush_tick=tick),
-    )
-    stream.set_log_time_enabled(False)
-    return stream
-
 
 def _line(figure: str, name: str, colour: tuple[int, int, int]) -> Visualizer:
     """A line of a plot."""
@@ -239,68 +102,12 @@ def _line(figure: str, name: str, colour: tuple[int, int, int]) -> Visualizer:
     return rr.SeriesLines(names=name, colors=[colour], widths=1.5).visualizer(mappings=[source])
 
 
-def _send(stream: rr.RecordingStream, frame: int, time: float, items: Items) -> None:
-    stream.set_time("sim_time", duration=time)
-    stream.set_time("frame", sequence=frame)
-    for entity, archetype in items:
-        stream.log(entity, archetype)
-
-
-class LiveView:
-    """A server on loopback that viewers connect to, come and go.
-
-    For a viewer that has frozen Rerun holds about 0.5 GB, then this drops frames.
-    """
-
-    def __init__(self, port: int, identity: str, blueprint: rrb.Blueprint):
-        """Serve at a port.
-
-        Raises:
-            InputError: the port is taken.
-        """
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError as error:
-                raise InputError(f"--live {port}: no port to serve at: {error.strerror}") from None
-        self.url = f"rerun+http://127.0.0.1:{port}/proxy"
-        self.dropped = 0
-        self._delivered = False
-        self.stream = _stream(identity, _LIVE_TICK)
-        self.stream.set_sinks(
-            rr.GrpcServerSink(bind_ip="127.0.0.1", port=port, server_memory_limit=LIVE_MEMORY),
-            default_blueprint=blueprint,
-        )
-        self._queue: queue.Queue[tuple[int, float, Items] | None] = queue.Queue(_LIVE_QUEUE)
-        self._thread = threading.Thread(target=self._pump, daemon=True, name="live view")
-        self._thread.start()
-
-    def _pump(self) -> None:
-        while item := self._queue.get():
-            _send(self.stream, *item)
-        try:
-            self.stream.flush(timeout_sec=_LIVE_TIMEOUT)
-        except RuntimeError:
-            return
-        self._delivered = True
-        self.stream.disconnect()
-
-    def offer(self, frame: int, time: float, items: Items) -> None:
-        """Show a frame, if the viewer keeps up."""
-        try:
-            self._queue.put_nowait((frame, time, items))
-        except queue.Full:
-            self.dropped += 1
-
-    def close(self) -> bool:
-        """End the server; False if a viewer has stalled and holds it up."""
-        try:
-            self._queue.put(None, timeout=_LIVE_TIMEOUT)
-        except queue.Full:
-            return False
-        self._thread.join(2.0 * _LIVE_TIMEOUT)
-        return self._delivered
+def application_of(simulation: "Simulation") -> str:
+    """Name by which viewers keep camera and layout: one for each vessel and its way up."""
+    scene, text = simulation.scene, hashlib.sha256()
+    text.update(np.ascontiguousarray(simulation.vessel.vertices, np.float64).tobytes())
+    text.update(repr((scene.title, scene.gravity)).encode())
+    return f"vesselflow {scene.name} {text.hexdigest()[:6]}"
 
 
 class RerunView:
@@ -340,23 +147,25 @@ class RerunView:
         self._wall: tuple[np.ndarray, np.ndarray] | None = None
         """Vertices of a wall that pulses, and how far each moves [m]."""
         blueprint = self._blueprint(simulation)
-        identity = str(uuid.uuid4())
+        application, identity = application_of(simulation), str(uuid.uuid4())
         self._writer: FileWriter | None = None
         self._file: rr.RecordingStream | None = None
         self.live: LiveView | None = None
         if port is not None:
-            self.live = LiveView(port, identity, blueprint)
+            self.live = LiveView(port, application, identity, blueprint)
         if path is not None:
-            self._file = _stream(identity, _FILE_TICK)
+            self._file = open_stream(application, identity, FILE_TICK)
             if not rr.is_enabled(self._file):
                 raise InputError("--rrd: the environment variable RERUN switches recordings off")
             self._writer = FileWriter(path)
             self._file.set_sinks(rr.FileSink(self._writer.sink_path), default_blueprint=blueprint)
             self._writer.opened()
-        for stream in self._streams():
-            self._introduce(stream, simulation, properties or {})
+        for stream in self.streams:
+            self._log_static(stream, simulation, properties or {})
 
-    def _streams(self) -> list[rr.RecordingStream]:
+    @property
+    def streams(self) -> list[rr.RecordingStream]:
+        """Where frames go: live view and file, as far as there are any."""
         live = [self.live.stream] if self.live else []
         return live + ([self._file] if self._file else [])
 
@@ -413,13 +222,13 @@ class RerunView:
             auto_layout=False,
         )
 
-    def _introduce(
+    def _log_static(
         self, stream: rr.RecordingStream, simulation: "Simulation", properties: dict[str, Any]
     ) -> None:
         """Log what never changes."""
-        scene, vessel, derived = simulation.scene, simulation.vessel, simulation.derived
+        scene, derived = simulation.scene, simulation.derived
         stream.send_recording_name(scene.title)
-        facts: dict[str, Any] = {
+        metadata: dict[str, Any] = {
             "scene": scene.name,
             "blood_particles": derived.blood_particles,
             "proxy_particles": derived.proxy_particles,
@@ -428,13 +237,19 @@ class RerunView:
             "sound_speed": derived.sound_speed,
             "colour_full_scale": self.full_scale,
         }
-        stream.send_property("simulation", rr.AnyValues(**(facts | properties)))
+        stream.send_property("simulation", rr.AnyValues(**(metadata | properties)))
         axes = np.eye(3)
         up = int(np.abs(upward(scene.gravity)).argmax())
         sign = "UP" if upward(scene.gravity) @ axes[up] > 0.0 else "DOWN"
         coordinates = getattr(rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[up]}_{sign}")
         stream.log("world", coordinates, static=True)
+        self._log_vessel(stream, simulation)
+        self._log_styles(stream, simulation)
+        stream.log("scene", rr.TextDocument(self._document(simulation), media_type="text/markdown"))
 
+    def _log_vessel(self, stream: rr.RecordingStream, simulation: "Simulation") -> None:
+        """Log the wall, open where blood may pass, and the names of the openings."""
+        vessel = simulation.vessel
         is_open = np.array([opening.is_open for opening in vessel.openings] + [False])
         faces = vessel.faces[~is_open[vessel.face_opening]]
         used, faces = np.unique(faces, return_inverse=True)
@@ -445,35 +260,28 @@ class RerunView:
         if wall_motion is not None:
             amplitude = wall_motion.motion.amplitude_at(vessel, vertices)
             self._wall = vertices, amplitude[:, None] * normals
-        stream.log(
-            "world/vessel",
-            rr.Mesh3D.from_fields(
-                # What is static hides what is logged with a time.
-                vertex_positions=vertices if wall_motion is None else None,
-                triangle_indices=faces,
-                vertex_normals=normals,
-                albedo_factor=list(WALL_COLOUR),
-            ),
-            static=True,
+        mesh = rr.Mesh3D.from_fields(
+            # What is static hides what is logged with a time.
+            vertex_positions=vertices if wall_motion is None else None,
+            triangle_indices=faces,
+            vertex_normals=normals,
+            albedo_factor=list(WALL_COLOUR),
         )
-        if vessel.openings:
-            stream.log(
-                "world/openings",
-                rr.Points3D(
-                    [
-                        opening.centre + _LABEL_DISTANCE * opening.radius * opening.normal
-                        for opening in vessel.openings
-                    ],
-                    labels=[
-                        f"{o.name} ({'open' if o.is_open else 'capped'})" for o in vessel.openings
-                    ],
-                    radii=0.5 * self._radius,
-                    colors=[[150, 150, 170]],
-                    show_labels=len(vessel.openings) < _NO_LABELS,
-                ),
-                static=True,
+        stream.log("world/vessel", mesh, static=True)
+        openings = vessel.openings
+        if openings:
+            names = rr.Points3D(
+                [o.centre + _LABEL_DISTANCE * o.radius * o.normal for o in openings],
+                labels=[f"{o.name} ({'open' if o.is_open else 'capped'})" for o in openings],
+                radii=0.5 * self._radius,
+                colors=[[150, 150, 170]],
+                show_labels=len(openings) < _NO_LABELS,
             )
-        looks: Items = [
+            stream.log("world/openings", names, static=True)
+
+    def _log_styles(self, stream: rr.RecordingStream, simulation: "Simulation") -> None:
+        """Log how thick and in what colours blood, droplets, wounds and tool are drawn."""
+        styles: Items = [
             ("blood", rr.Points3D.from_fields(radii=self._radius)),
             ("drops", rr.Points3D.from_fields(radii=self._radius, colors=[DROP_COLOUR])),
             (
@@ -483,17 +291,16 @@ class RerunView:
         ]
         shape = simulation.tool.surface
         if shape is None:
-            looks.append(("tool", rr.Points3D.from_fields(colors=[TOOL_COLOUR])))
+            styles.append(("tool", rr.Points3D.from_fields(colors=[TOOL_COLOUR])))
         else:
             body = rr.Mesh3D(
                 vertex_positions=shape.vertices,
                 triangle_indices=shape.faces,
                 albedo_factor=TOOL_COLOUR,
             )
-            looks.append(("tool/shape", body))
-        for entity, look in looks:
-            stream.log(f"world/{entity}", look, static=True)
-        stream.log("scene", rr.TextDocument(self._document(simulation), media_type="text/markdown"))
+            styles.append(("tool/shape", body))
+        for entity, style in styles:
+            stream.log(f"world/{entity}", style, static=True)
 
     def _document(self, simulation: "Simulation") -> str:
         scene, derived = simulation.scene, simulation.derived
@@ -504,7 +311,7 @@ class RerunView:
             f"{self.full_scale:.2g} m/s and above.\n\n```toml\n{scene.text}\n```\n"
         )
 
-    def on_frame(self, simulation: "Simulation", frame: int, figures: "Diagnostics") -> None:
+    def on_frame(self, simulation: "Simulation", frame: int, diagnostics: "Diagnostics") -> None:
         """Show a frame.
 
         Raises:
@@ -520,38 +327,38 @@ class RerunView:
                 narrow, way = self._wall
                 wall = narrow + simulation.wall.displacement_factor * way
                 items.append(("world/vessel", rr.Mesh3D.from_fields(vertex_positions=wall)))
-        in_vessel = figures.particles / max(1, simulation.derived.blood_particles) * self._volume
+        fraction = diagnostics.particles / max(1, simulation.derived.blood_particles)
         values = {
-            "max_speed": figures.max_speed,
-            "kinetic_energy": 1e3 * figures.kinetic_energy,
-            "compression_p99": 1e2 * figures.compression_p99,
-            "compression_max": 1e2 * figures.compression_max,
-            "in_vessel": 1e6 * in_vessel,
-            "drained": 1e6 * figures.drained_volume,
-            "driven_in": 1e6 * figures.added_volume,
-            "bled": 1e6 * figures.bled_volume,
-            "sucked": 1e6 * figures.sucked_volume,
-            "leaks": figures.leaks,
-            "wall_corrections": figures.wall_corrections,
-            "step": 1e3 * figures.step,
-            "fallback_share": 1e2 * figures.fallback_share,
+            "max_speed": diagnostics.max_speed,
+            "kinetic_energy": 1e3 * diagnostics.kinetic_energy,
+            "compression_p99": 1e2 * diagnostics.compression_p99,
+            "compression_max": 1e2 * diagnostics.compression_max,
+            "in_vessel": 1e6 * fraction * self._volume,
+            "drained": 1e6 * diagnostics.drained_volume,
+            "driven_in": 1e6 * diagnostics.added_volume,
+            "bled": 1e6 * diagnostics.bled_volume,
+            "sucked": 1e6 * diagnostics.sucked_volume,
+            "leaks": diagnostics.leaks,
+            "wall_corrections": diagnostics.wall_corrections,
+            "step": 1e3 * diagnostics.step,
+            "fallback_share": 1e2 * diagnostics.fallback_share,
         }
         row = pa.array([values], type=_FIGURES)
         items.append(("figures", rr.DynamicArchetype("figures", components={"values": row})))
-        self._last = (frame, figures.time)
+        self._last = (frame, diagnostics.time)
         if self._file and self._writer:
             self._writer.check()
-            _send(self._file, frame, figures.time, items)
+            send(self._file, frame, diagnostics.time, items)
             if self._checkpoint and frame % self._checkpoint == 0:
                 # A full disk is said at the next frame, for the checkpoint can still be written.
                 try:
-                    self._file.flush(timeout_sec=_TIMEOUT)
+                    self._file.flush(timeout_sec=DISK_TIMEOUT)
                 except RuntimeError:
                     if not self._writer.error:
-                        raise self._writer.silent from None
-                self._writer.empty()
+                        raise self._writer.timeout_error from None
+                self._writer.drain()
         if self.live:
-            self.live.offer(frame, figures.time, items)
+            self.live.offer(frame, diagnostics.time, items)
 
     def _surgery(self, simulation: "Simulation") -> Items:
         """Drops outside, open wounds and the tool."""
@@ -581,19 +388,23 @@ class RerunView:
         """Keep a sentence in the log, at the time of the frame that is under way."""
         self._notes.append(("log", rr.TextLog(text, level=rr.TextLogLevel.INFO)))
 
-    def close(self, ending: str) -> None:
+    def close(self, ending: str) -> bool:
         """Say how the run ended and finish the file.
+
+        Returns:
+            whether a viewer has stalled: Rerun would wait half a minute for it at Python's exit.
 
         Raises:
             OSError: the recording could not be written to its end.
         """
         frame, time = self._last
         last: Items = [("log", rr.TextLog(ending, level=rr.TextLogLevel.INFO))]
+        stalled = False
         if self.live:
             self.live.offer(max(frame, 0), time, last)
-            if not self.live.close():
-                _stalled.append(self.live)
+            stalled = not self.live.close()
         if self._file and self._writer:
-            _send(self._file, max(frame, 0), time, last)
+            send(self._file, max(frame, 0), time, last)
             self._file.disconnect()
             self._writer.close()
+        return stalled

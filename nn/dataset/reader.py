@@ -25,7 +25,7 @@ from nn.dataset.schema import (
 )
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, parse_scene
-from taichi_sph.scene_files import file_names, sha256, with_files
+from taichi_sph.scene_files import named_files, sha256, with_files
 
 """Recorded runs, read: checked when opened, rows when asked for."""
 
@@ -99,7 +99,7 @@ class SceneFiles:
             InputError: a file that it names is missing, or differs from what was recorded.
         """
         contents = {}
-        for name in file_names(scene):
+        for _, name in named_files(scene):
             wanted = facts.surface_sha256 if name == scene.vessel.surface else facts.tool_sha256
             if self._contents is not None and name in self._contents:
                 wanted = sha256(self._contents[name])

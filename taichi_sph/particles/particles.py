@@ -13,13 +13,11 @@ from taichi_sph.runtime import float_dtype, require_runtime, runtime_number
 
 @dataclass(frozen=True)
 class Quantity:
-    """One thing that each particle carries: sorted, saved, loaded and, if said, hashed with it."""
+    """One thing that each particle carries: sorted, saved, loaded and hashed with it."""
 
     name: str
     kind: Literal["scalar", "vector", "integer"] = "scalar"
     """A float, three of them, or a 32-bit integer."""
-    in_digest: bool = False
-    """Whether a replay's digest covers it."""
 
     def make_field(self, rows: int) -> Any:
         """A field of so many zeros."""
@@ -29,13 +27,13 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity("identity", "integer", in_digest=True),
-    Quantity("position", "vector", in_digest=True),
-    Quantity("velocity", "vector", in_digest=True),
+    Quantity("identity", "integer"),
+    Quantity("position", "vector"),
+    Quantity("velocity", "vector"),
     Quantity("acceleration", "vector"),
     Quantity("density"),
 )
-"""What every particle has, in the order in which the digest takes it; more follow after these."""
+"""What every particle has; more follow after these."""
 
 
 class Particles:
@@ -115,6 +113,11 @@ class Particles:
             field.from_numpy(whole)
         self.count[None] = len(rows["identity"])
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all quantities."""
+        return tuple(quantity.name for quantity in self.quantities)
+
     def rows(self) -> dict[str, np.ndarray]:
         """Copies of all quantities by name, (n,) or (n, 3), in the order of the grid."""
         require_runtime(self._runtime)
@@ -123,14 +126,6 @@ class Particles:
             quantity.name: field.to_numpy()[:n]
             for quantity, field in zip(self.quantities, self.fields, strict=True)
         }
-
-    def digested_rows(self) -> list[np.ndarray]:
-        """Copies of what a replay's digest covers, in the order of the quantities."""
-        identity, position, velocity = self.live()
-        n, more = len(identity), zip(self.quantities[len(QUANTITIES) :],
-                                     self.fields[len(QUANTITIES) :], strict=True)  # fmt: skip
-        rows = [field.to_numpy()[:n] for quantity, field in more if quantity.in_digest]
-        return [identity, position, velocity, *rows]
 
     def in_order(self, field: ti.Field) -> np.ndarray:
         """Copy of a field's live rows, sorted by identity."""

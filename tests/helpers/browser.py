@@ -82,6 +82,11 @@ class Browser:
         y = canvas["y"] + 0.5 * canvas["height"] - scale * (way @ np.cross(back, right))
         return round(x), round(y)
 
+    def corner(self) -> tuple[int, int]:
+        """A pixel beside the vessel."""
+        canvas = self.find("//canvas").rect
+        return round(canvas["x"]) + 10, round(canvas["y"] + canvas["height"]) - 10
+
     def drag(self, *pixels: tuple[int, int]) -> None:
         """Press at the first, let go at the last."""
         from selenium.webdriver.common.action_chains import ActionBuilder

@@ -1,4 +1,4 @@
-"""A session without physics, for tests of what commands one: it keeps what it is offered."""
+"""A session without physics, for tests of what commands one: it keeps what is submitted to it."""
 
 import math
 import threading
@@ -39,8 +39,12 @@ class FakeSession:
         self.vessel = read_vessel(self.scene)
         low, high = self.vessel.bounds
         middle = 0.5 * (low + high)
+        self.tool_start = middle
         self.wounds: list[Wound] = []
-        self.tool = SimpleNamespace(surface=shape, position=middle, rotation=Rotation.identity())
+        self.tool = SimpleNamespace(
+            surface=shape, position=middle, rotation=Rotation.identity(),
+            target_position=middle, target_rotation=Rotation.identity(),
+        )  # fmt: skip
         self.simulation: Any = SimpleNamespace(
             scene=self.scene,
             vessel=self.vessel,
@@ -49,17 +53,23 @@ class FakeSession:
             wounds=self.wounds,
             model=SimpleNamespace(name="physics"),
         )
-        self.models = {"physics": None, "implicit": None, "pcnet": None}
+        self.models = SimpleNamespace(
+            names=("physics", "implicit", "pcnet", "auto"), selected="physics"
+        )
         self.driven = [opening.name for opening in self.vessel.openings[:2]]
         random = np.random.default_rng(7)
         wall = random.choice(self.vessel.vertices, particles)
         self.positions = middle + 0.9 * np.sqrt(random.random((particles, 1))) * (wall - middle)
-        self.drops = middle + 0.2 * (high - low) * random.normal(size=(particles // 20, 3))
+        self.droplets = middle + 0.2 * (high - low) * random.normal(size=(particles // 20, 3))
         self.lock = threading.Lock()
-        self.offered: list[dict[str, Any]] = []
+        self.submitted: list[dict[str, Any]] = []
         self.sources: set[str] = set()
         self.full = False
-        self.pictures = 0
+        self.refuses = ""
+        """Why commands are refused at their step, if they are."""
+        self.delay: list[Callable[[], None]] | None = None
+        """Where results are kept back, if they are."""
+        self.frames_asked_for = 0
         self.start, self.last = time.monotonic(), 0.0
         self.state: dict[str, Any] = {
             "paused": False,
@@ -69,12 +79,17 @@ class FakeSession:
             "suction": 0.0,
         }
 
-    def offer(self, given: bytes | str | dict[str, Any], source: str) -> None:
-        command = as_dict(parse_command(given))
+    def submit(
+        self,
+        value: bytes | str | dict[str, Any],
+        source: str,
+        on_result: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        command = as_dict(parse_command(value))
         with self.lock:
             if self.full:
                 raise InputError("the queue is full; wait until the simulation has caught up")
-            self.offered.append(command)
+            self.submitted.append(command)
             self.sources.add(source)
             kind = command["command"]
             if kind == "pause":
@@ -82,20 +97,36 @@ class FakeSession:
             elif kind == "model":
                 self.state["model"] = command["name"]
             elif kind == "tool":
-                self.tool.position = np.array(command["position"])
+                self.tool.position = self.tool.target_position = np.array(command["position"])
+                if "rotation" in command:
+                    turn = Rotation.from_quat(np.roll(command["rotation"], -1))
+                    self.tool.target_rotation = turn
+            elif kind == "reset":
+                self.tool.position = self.tool.target_position = self.tool_start
+                self.tool.target_rotation = Rotation.identity()
             elif kind == "wound":
                 at = np.array(command["centre"])
                 self.wounds.append(Wound(at, at, np.array([0.0, 0.0, 1.0]), command["radius"]))
             elif kind == "clamp":
                 for number, wound in enumerate(self.wounds):
                     wound.is_open &= command.get("wound", number) != number
+        if on_result is not None:
+            result: dict[str, Any] = {
+                "applied": command, "step": len(self.submitted), "time": self.last,
+            }  # fmt: skip
+            if self.refuses:
+                result = {"refused": self.refuses}
+            if self.delay is None:
+                on_result(result)
+            else:
+                self.delay.append(lambda: on_result(result))
 
     def of(self, kind: str) -> list[dict[str, Any]]:
         """Commands of a kind, as they came."""
         with self.lock:
-            return [command for command in self.offered if command["command"] == kind]
+            return [command for command in self.submitted if command["command"] == kind]
 
-    def figures(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         with self.lock:
             return self.state | {
                 "time": time.monotonic() - self.start,
@@ -111,11 +142,11 @@ class FakeSession:
                 "wounds": [],
                 "tool_position": [float(x) for x in self.tool.position],
                 "tool_force": [0.3, 0.0, 0.4],
-                "frames": self.pictures,
+                "frames": self.frames_asked_for,
             }
 
-    def picture(self, known: Any) -> Any:
-        self.pictures += 1
+    def latest_frame(self, known: Any) -> Any:
+        self.frames_asked_for += 1
         if not self.state["paused"]:
             self.last = time.monotonic() - self.start
         swirl = np.sin(2.0 * self.last + 200.0 * self.positions[:, :1])
@@ -124,5 +155,5 @@ class FakeSession:
             time=self.last,
             positions=position,
             velocities=(np.abs(swirl) * [0.0, 0.0, 1.0]).astype(np.float32),
-            drops=self.drops.astype(np.float32),
+            droplets=self.droplets.astype(np.float32),
         )

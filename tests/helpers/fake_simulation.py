@@ -85,7 +85,7 @@ class FakeSimulation:
 def main() -> None:
     from app.cli import leave
     from app.run.loop import drive
-    from app.view.rerun_view import RerunView, viewer_stalled
+    from app.view.rerun_view import RerunView
 
     file, frames, particles, *port = sys.argv[1:]
     simulation: Any = FakeSimulation(int(particles), pause=0.01)
@@ -107,11 +107,11 @@ def main() -> None:
             view.on_frame(*arguments)
             slowest = max(slowest, clock.perf_counter() - before)
 
-        def close(self, ending: str) -> None:
-            view.close(ending)
+        def close(self, ending: str) -> bool:
+            return view.close(ending)
 
     outcome = drive(simulation, [Timed(), Teller()], 0.01 * int(frames), 0.01)
-    leave(str(outcome.error) if outcome.error else "", 2 if outcome.error else 0, viewer_stalled())
+    leave(str(outcome.error or ""), outcome.exit_code, at_once=bool(outcome.stalled))
 
 
 if __name__ == "__main__":

@@ -1,15 +1,19 @@
+import contextlib
 import json
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from app.cli import invoke
 from app.control import channel as channel_module
-from app.control.channel import LONGEST_LINE, MOST_CLIENTS, RATE, Channel
+from app.control.channel import BURST, LONGEST_LINE, MOST_CLIENTS, RATE, Channel
+from app.control.ports import bind_ports, listen
 from fake_session import PATIENCE, FakeSession, wait_until
 from taichi_sph.errors import InputError
 
@@ -17,6 +21,12 @@ PAUSE = b'{"command": "pause"}\n'
 FIGURES = b'{"query": "figures"}\n'
 SOON = 2.0
 """A reply takes a millisecond; a machine that stumbles may take this [s]."""
+
+
+def serve(
+    session: Any, host: str = "127.0.0.1", port: int = 0, token: str | None = None
+) -> Channel:
+    return Channel(session, listen(host, port, "channel"), token)
 
 
 class Client:
@@ -60,7 +70,7 @@ def session() -> Any:
 
 @pytest.fixture
 def channel(session: Any, caplog: pytest.LogCaptureFixture) -> Iterator[Channel]:
-    channel = Channel(session)
+    channel = serve(session)
     yield channel
     channel.close()
     assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == []
@@ -68,14 +78,14 @@ def channel(session: Any, caplog: pytest.LogCaptureFixture) -> Iterator[Channel]
 
 @pytest.fixture
 def guarded(session: Any) -> Iterator[Channel]:
-    channel = Channel(session, token="sésame")
+    channel = serve(session, token="sésame")
     yield channel
     channel.close()
 
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(channel_module, "_PATIENCE", 0.2)
+    monkeypatch.setattr(channel_module, "CLIENT_TIMEOUT", 0.2)
 
 
 def works(channel: Channel) -> bool:
@@ -139,7 +149,7 @@ def test_what_is_no_command_is_answered_in_a_sentence(
         assert client.ask(PAUSE) == {"ok": True}
         assert "allowed" in client.ask(line)["error"]
         assert client.ask(PAUSE) == {"ok": True}
-    assert len(session.offered) == 2
+    assert len(session.submitted) == 2
 
 
 def test_a_full_queue_is_an_error_and_not_the_end(channel: Channel, session: Any) -> None:
@@ -166,7 +176,7 @@ def test_a_browser_is_sent_away_unheard(channel: Channel, session: Any, first: b
         assert "no JSON object" in client.reply()["error"]
         assert client.at_end()
     assert works(channel)
-    assert len(session.offered) == 1
+    assert len(session.submitted) == 1
 
 
 def test_a_line_without_end_is_cut_off(channel: Channel, session: Any) -> None:
@@ -180,7 +190,7 @@ def test_a_line_without_end_is_cut_off(channel: Channel, session: Any) -> None:
         assert str(LONGEST_LINE) in client.reply()["error"]
         assert client.at_end()
     assert works(channel)
-    assert len(session.offered) == 2
+    assert len(session.submitted) == 2
 
 
 def test_a_flood_is_served_at_its_rate_and_others_are_served_beside_it(
@@ -192,18 +202,18 @@ def test_a_flood_is_served_at_its_rate_and_others_are_served_beside_it(
         flood.send(PAUSE * lines)
         flood.socket.shutdown(socket.SHUT_WR)
         assert works(channel)
-        assert len(session.offered) < lines, "the flood is still waiting"
+        assert len(session.submitted) < lines, "the flood is still waiting"
         assert flood.file.read() == lines * b'{"ok":true}\n'
         # Nothing lost; the burst comes at once.
-        assert time.monotonic() - begin > (lines / RATE - channel_module._BURST) * 0.99
+        assert time.monotonic() - begin > (lines / RATE - BURST) * 0.99
 
 
 def test_who_never_reads_its_replies_is_closed(
     channel: Channel, session: Any, impatient: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Replies of a megabyte fill what the system holds for a connection.
-    figures = session.figures() | {"model": "x" * (1 << 20)}
-    monkeypatch.setattr(session, "figures", lambda: figures)
+    figures = session.status() | {"model": "x" * (1 << 20)}
+    monkeypatch.setattr(session, "status", lambda: figures)
     with Client(channel) as client:
         client.send(FIGURES * 50)
         wait_until(lambda: not channel.clients)
@@ -213,8 +223,8 @@ def test_who_never_reads_its_replies_is_closed(
 def test_who_reads_late_gets_all_replies(
     channel: Channel, session: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    figures = session.figures() | {"model": "x" * (8 << 20)}
-    monkeypatch.setattr(session, "figures", lambda: figures)
+    figures = session.status() | {"model": "x" * (8 << 20)}
+    monkeypatch.setattr(session, "status", lambda: figures)
     with Client(channel) as client:
         client.send(FIGURES * 2, FIGURES.strip())
         client.socket.shutdown(socket.SHUT_WR)
@@ -288,7 +298,7 @@ def test_who_does_not_know_the_token_is_closed(
         client.send(first, '{"token": "sésame"}\n'.encode(), PAUSE)
         assert "token" in client.reply()["error"]
         assert client.at_end()
-    assert not session.offered
+    assert not session.submitted
 
 
 def test_who_shows_no_token_for_long_is_closed(
@@ -302,8 +312,8 @@ def test_who_shows_no_token_for_long_is_closed(
 def test_other_machines_need_a_token(session: Any) -> None:
     for host in ("0.0.0.0", "::"):
         with pytest.raises(InputError, match="token"):
-            Channel(session, host=host)
-    channel = Channel(session, host="localhost", token=None)
+            serve(session, host=host)
+    channel = serve(session, host="localhost")
     assert channel.host in ("127.0.0.1", "::1")
     channel.close()
 
@@ -313,16 +323,16 @@ def test_other_machines_need_a_token(session: Any) -> None:
 )
 def test_an_address_that_is_none_is_refused(session: Any, host: str, port: int) -> None:
     with pytest.raises(InputError, match="channel"):
-        Channel(session, host=host, port=port)
+        serve(session, host=host, port=port)
 
 
 def test_a_taken_port_is_refused(channel: Channel, session: Any) -> None:
     with pytest.raises(InputError, match=f"{channel.port}: no port to serve at"):
-        Channel(session, port=channel.port)
+        serve(session, port=channel.port)
 
 
 def test_close_ends_clients_and_thread_and_frees_the_port(session: Any) -> None:
-    channel = Channel(session)
+    channel = serve(session)
     with Client(channel) as client, Client(channel) as flood:
         assert client.ask(PAUSE) == {"ok": True}
         flood.send(PAUSE * 2000)
@@ -332,4 +342,141 @@ def test_close_ends_clients_and_thread_and_frees_the_port(session: Any) -> None:
         assert client.at_end()
     channel.close()
     assert "channel" not in {thread.name for thread in threading.enumerate()}
-    Channel(session, port=channel.port).close()
+    serve(session, port=channel.port).close()
+
+
+# Commands with an id
+
+
+def test_a_command_with_an_id_is_told_of_when_it_is_applied_and_as_it_was(
+    channel: Channel, session: Any
+) -> None:
+    session.delay = []
+    with Client(channel) as client:
+        assert client.ask(b'{"command": "pause", "id": 7}\n') == {"ok": True, "id": 7}
+        assert client.ask(b'{"query": "figures", "id": "a"}\n')["id"] == "a"
+        session.delay.pop()()
+        event = client.reply()
+        assert event.pop("time") >= 0.0
+        assert event == {"id": 7, "applied": {"command": "pause", "on": True}, "step": 1}
+        assert client.ask(PAUSE) == {"ok": True}, "without an id there is one reply"
+        assert client.ask(PAUSE) == {"ok": True}
+    assert not any("id" in command for command in session.submitted)
+
+
+def test_a_refusal_at_once_and_one_at_the_step_carry_the_id(channel: Channel, session: Any) -> None:
+    session.refuses = "wound: the wall is 0.0136 m away"
+    with Client(channel) as client:
+        assert "no command" in client.ask(b'{"command": "dance", "id": 1}\n')["error"]
+        client.send(b'{"command": "dance", "id": 1}\n', b'{"command": "pause", "id": 2}\n')
+        assert client.reply()["id"] == 1
+        assert client.reply() == {"ok": True, "id": 2}
+        assert client.reply() == {"id": 2, "refused": session.refuses}
+
+
+@pytest.mark.parametrize(
+    "number", [b"1.5", b"[1]", b"{}", b"true", b'"' + 65 * b"x" + b'"', b"1e30"]
+)
+def test_an_id_that_is_none_is_refused_in_a_sentence(
+    channel: Channel, session: Any, number: bytes
+) -> None:
+    with Client(channel) as client:
+        assert "no id" in client.ask(b'{"command": "pause", "id": ' + number + b"}\n")["error"]
+        assert client.ask(b'{"command": "pause", "id": null}\n') == {"ok": True}
+    assert len(session.submitted) == 1
+
+
+def test_who_ends_its_side_is_told_what_became_of_its_commands(
+    channel: Channel, session: Any
+) -> None:
+    session.delay = []
+    with Client(channel) as client:
+        client.send(b'{"command": "pause", "id": 1}\n{"command": "step", "id": 2}')
+        client.socket.shutdown(socket.SHUT_WR)
+        assert [client.reply()["id"] for _ in range(2)] == [1, 2]
+        wait_until(lambda: len(session.delay) == 2)
+        for tell in session.delay:
+            tell()
+        assert [client.reply()["applied"]["command"] for _ in range(2)] == ["pause", "step"]
+        assert client.at_end()
+
+
+def test_results_for_clients_that_have_left_and_after_the_end_harm_nobody(
+    channel: Channel, session: Any
+) -> None:
+    session.delay = []
+    with Client(channel) as client:
+        client.ask(b'{"command": "pause", "id": 1}\n')
+        client.ask(b'{"command": "pause", "id": 2}\n')
+    session.delay.pop()()
+    assert works(channel)
+    channel.close()
+    session.delay.pop()()
+
+
+def test_an_unknown_query_says_which_there_are(channel: Channel) -> None:
+    with Client(channel) as client:
+        for query in (b'{"query": "state"}', b'{"query": 3}', b'{"query": "figures", "at": 1}'):
+            answer = client.ask(query + b"\n")["error"]
+            assert answer.startswith("no query: ") and answer.endswith("allowed are figures")
+        # A word in a command is no query.
+        command = b'{"command": "inflow", "opening": "query", "factor": 1}\n'
+        assert client.ask(command) == {"ok": True}
+
+
+# Ports
+
+
+def test_ports_that_are_taken_are_told_with_one_that_is_free(session: Any) -> None:
+    with (
+        contextlib.closing(listen("127.0.0.1", 0, "test")) as page,
+        contextlib.closing(listen("127.0.0.1", 0, "test")) as channel,
+    ):
+        for taken, asked in ((page, 0), (channel, -1)):
+            port = taken.getsockname()[1]
+            with pytest.raises(InputError) as error:
+                bind_ports(port + asked, "127.0.0.1", None)
+            assert f"port {port} of 127.0.0.1 cannot be had" in str(error.value)
+            free = int(str(error.value).split("--control ")[-1].split()[0])
+            assert free not in (port, port - 1)
+            bind_ports(free, "127.0.0.1", None).close()
+            # What was bound before the refusal is given back.
+            with pytest.raises(InputError, match="cannot be had"):
+                bind_ports(port + asked, "127.0.0.1", None)
+
+
+def test_a_host_without_a_token_or_that_is_none_binds_nothing(monkeypatch: Any) -> None:
+    port = bind_free()
+    for host, why in (("0.0.0.0", "token"), ("a..b", "no port to serve at"), ("192.0.2.1", "no")):
+        with pytest.raises(InputError, match=why):
+            bind_ports(port, host, None)
+        bind_ports(port, "127.0.0.1", None).close()
+    bind_ports(port, "0.0.0.0", "a token").close()
+
+
+def bind_free() -> int:
+    """A port that is free together with the next."""
+    with contextlib.closing(listen("127.0.0.1", 0, "test")) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError) as error:
+            bind_ports(port, "127.0.0.1", None)
+    return int(str(error.value).split("--control ")[-1].split()[0])
+
+
+def test_a_start_that_is_refused_touches_no_file_and_says_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    recording = b"RRF2 an earlier recording"
+    Path("a.rrd").write_bytes(recording)
+    with contextlib.closing(listen("127.0.0.1", 0, "test")) as taken:
+        port = taken.getsockname()[1]
+        for more in (["--control", port], ["--control", port - 1]):
+            sentence, code = invoke(["run", "box", "--rrd", "a.rrd", *map(str, more)])
+            assert code == 2 and "cannot be had" in sentence and "is free" in sentence
+    free = ["--control", str(bind_free()), "--host", "0.0.0.0"]
+    sentence, code = invoke(["run", "box", "--rrd", "a.rrd", *free])
+    assert code == 2 and "token" in sentence
+    assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
+    assert Path("a.rrd").read_bytes() == recording
+    assert capfd.readouterr() == ("", "")

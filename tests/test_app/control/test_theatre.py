@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.control.auto_model import ModelSelection
+from app.control.log import LogWriter
 from app.control.page import ControlPage
+from app.control.ports import listen
 from app.control.session import Session
-from app.models import MODELS, model_factory
+from app.models import MODELS
 from browser import Browser, needs_viser
 from fake_session import wait_until
 from taichi_sph.scene import read_scene
@@ -23,8 +26,9 @@ class Theatre:
     def __init__(self, folder: Path):
         scene = read_scene(folder / "scene.toml")
         self.simulation = Simulation.from_scene(scene)
-        makers = {name: model_factory(name, scene) for name in MODELS}
-        self.session = Session(self.simulation, makers, folder / "theatre.jsonl")
+        models = ModelSelection(self.simulation, MODELS)
+        log = LogWriter(folder / "theatre.jsonl", {}, self.simulation.particles.names)
+        self.session = Session(self.simulation, models, log)
         self.closing = False
         self.thread = threading.Thread(target=self.run)
         self.thread.start()
@@ -38,8 +42,8 @@ class Theatre:
 
     def close(self) -> None:
         self.closing = True
-        self.session.offer({"command": "speed"}, "test")
-        self.session.offer({"command": "pause", "on": False}, "test")
+        self.session.submit({"command": "speed"}, "test")
+        self.session.submit({"command": "pause", "on": False}, "test")
         self.thread.join()
         self.session.close("tested")
 
@@ -51,6 +55,7 @@ def theatre(driven: Path) -> Iterator[Theatre]:
     made.close()
 
 
+@pytest.mark.validation
 @needs_viser
 def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -> None:
     pytest.importorskip("selenium", reason="selenium is not installed")
@@ -59,8 +64,8 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
             pytest.skip(f"{program} is not installed")
     simulation, session = theatre.simulation, theatre.session
     scene, tool, suction = simulation.scene, simulation.tool, simulation.suction
-    page = ControlPage(session, port=0)
-    session.refusals.append(page.tell)
+    page = ControlPage(session, listen("127.0.0.1", 0, "page"))
+    session.on_rejected.append(page.tell)
     browser = Browser(page, np.asarray(simulation.vessel.vertices, float), scene.gravity)
     try:
         wait_until(
@@ -69,7 +74,7 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         browser.find("//*[contains(., 'Software')]//button[1]").click()
         browser.press("hold")
         wait_until(lambda: session.paused)
-        wait_until(lambda: getattr(session.picture(None), "time", None) == simulation.time)
+        wait_until(lambda: getattr(session.latest_frame(None), "time", None) == simulation.time)
         steps = simulation.steps
         browser.press("one step")
         wait_until(lambda: simulation.steps == steps + 1)
@@ -77,7 +82,7 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         browser.choose("model", "implicit")
         wait_until(lambda: simulation.model.name == "implicit")
         browser.choose("model", "auto")
-        wait_until(lambda: session.auto and simulation.model.name == "pcnet")
+        wait_until(lambda: session.models.auto and simulation.model.name == "pcnet")
 
         browser.enter("right [deg]", 90)
         wait_until(lambda: abs(simulation.gravity[2]) < 1e-6)
@@ -85,8 +90,8 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         browser.enter("top", 0.5)
         wait_until(lambda: [o.target_factor for o in simulation.inflow.openings] == [0.5, 1.0])
         place = tool.target_position
-        right = page._right
-        browser.pull(page._grip, np.eye(3)[int(np.abs(right).argmax())])
+        right = page.right
+        browser.pull(page.tool_handle, np.eye(3)[int(np.abs(right).argmax())])
         wait_until(lambda: not np.array_equal(tool.target_position, place))
         browser.enter("rate [ml/min]", 120)
         browser.find('//label[.="suction"]/following::input[1]').click()
@@ -101,7 +106,7 @@ def test_every_control_of_the_page_is_seen_in_the_simulation(theatre: Theatre) -
         browser.press("go on")
         wait_until(lambda: not session.paused)
         wait_until(lambda: simulation.steps > steps + 20)
-        wait_until(lambda: session.figures()["lost"] > 0.0, patience=60.0)
+        wait_until(lambda: session.status()["lost"] > 0.0, patience=60.0)
         browser.find("//td[.='lost blood']/following::td[1][not(.='0.00 ml')]")
         browser.press("Clamp")
         wait_until(lambda: not next(iter(simulation.wounds)).is_open)

@@ -1,18 +1,21 @@
+import errno
 import re
-import resource
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 
 from app.run.loop import drive
-from app.view import rerun_view as view_module
+from app.view import rerun_streams
 from app.view.appearance import (
     ASPECT,
     COLOURS,
@@ -23,7 +26,7 @@ from app.view.appearance import (
     speed_levels,
     upward,
 )
-from app.view.rerun_view import PLOTS, RerunView
+from app.view.rerun_view import PLOTS, RerunView, application_of
 from fake_simulation import FakeSimulation
 from places import ROOT
 from recordings import (
@@ -38,7 +41,6 @@ from recordings import (
 )
 from taichi_sph.boundary.wounds import Wound
 from taichi_sph.errors import InputError
-from taichi_sph.geometry.mesh import vertex_normals
 
 FAKE = ROOT / "tests" / "helpers" / "fake_simulation.py"
 PATIENCE = 120.0
@@ -202,17 +204,27 @@ def test_at_a_checkpoint_the_file_has_all_so_far(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
-    file = tmp_path / "run.rrd"
+    file, most = tmp_path / "run.rrd", 1_000_000
+    simulation: Any = FakeSimulation(5000)
+    view = RerunView(simulation, file)
+    writer: Any = view._writer
+    disk = writer._file
 
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+    def write(data: memoryview) -> int:
+        room = most - disk.tell()
+        if room <= 0:
+            raise OSError(errno.EFBIG, "File too large")
+        return disk.write(data[:room])
 
-    with start_fake(file, 10_000, 5000, preexec_fn=limit) as program:
-        _, complaint = program.communicate(timeout=PATIENCE)
-    assert program.returncode == 2
+    writer._file = SimpleNamespace(write=write, fileno=disk.fileno, close=disk.close)
+    # Bytes go out every few seconds; here the disk is waited for at each frame.
+    view._checkpoint = 1
+    outcome = drive(simulation, [view], until=100.0, frame_interval=0.01)
+    complaint = str(outcome.error)
+    assert outcome.exit_code == 2
     assert complaint.startswith(f"{file}: the recording cannot be written: File too large; ")
-    assert complaint.count("\n") == 1
-    assert file.stat().st_size == 1_000_000
+    assert "\n" not in complaint
+    assert file.stat().st_size == most
 
 
 def test_a_disk_that_fills_up_with_the_last_bytes_is_noticed(
@@ -224,12 +236,14 @@ def test_a_disk_that_fills_up_with_the_last_bytes_is_noticed(
         view.close("finished")
 
 
-def test_nobody_looking_at_the_live_view_costs_nothing(tmp_path: Path) -> None:
+def test_nobody_looking_at_the_live_view_costs_nothing(
+    simulation: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "run.rrd"
-    with start_fake(file, 100, 5000, free_port()) as program:
-        _, complaint = program.communicate(timeout=PATIENCE)
-    assert program.returncode == 0, complaint
-    assert complaint == ""
+    view = RerunView(simulation, file, free_port())
+    outcome = drive(simulation, [view], until=1.0, frame_interval=0.01)
+    assert outcome.error is None and not outcome.stalled
+    assert capfd.readouterr() == ("", "")
     assert verify(file)
     assert sorted(positions(file)) == list(range(101))
 
@@ -248,6 +262,34 @@ def test_a_viewer_gets_the_frames_and_may_vanish(tmp_path: Path) -> None:
     assert sorted(positions(file)) == list(range(201))
 
 
+def test_a_viewer_that_stalls_loses_frames_and_is_told_of_at_the_end(
+    simulation: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_streams, "_LIVE_TIMEOUT", 0.05)
+    file = tmp_path / "run.rrd"
+    view = RerunView(simulation, file, free_port())
+    assert view.live
+    stalled, stream = threading.Event(), view.live.stream
+
+    class Frozen:
+        """A stream that blocks, as Rerun does for a viewer that does not read."""
+
+        def set_time(self, *_: Any, **__: Any) -> None:
+            stalled.wait()
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(stream, name)
+
+    view.live.stream = Frozen()  # type: ignore[assignment]
+    outcome = drive(simulation, [view], until=0.2, frame_interval=0.01)
+    assert outcome.stalled == (view,) and outcome.error is None
+    assert view.live.dropped >= 21 - 1 - rerun_streams._LIVE_QUEUE
+    assert verify(file)
+    assert sorted(positions(file)) == list(range(21))
+    stalled.set()
+
+
+@pytest.mark.validation
 def test_a_frozen_viewer_neither_slows_the_run_nor_costs_the_file_a_frame(tmp_path: Path) -> None:
     file, port = tmp_path / "run.rrd", free_port()
     if shutil.disk_usage(tmp_path).free < 3_000_000_000:
@@ -267,7 +309,7 @@ def test_a_frozen_viewer_neither_slows_the_run_nor_costs_the_file_a_frame(tmp_pa
 
 
 def test_a_port_that_is_taken_is_an_input_error(simulation: Any) -> None:
-    with view_module.socket.socket() as other:
+    with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
@@ -330,9 +372,15 @@ def test_the_eye_has_all_of_the_vessel_in_view(gravity: tuple[float, float, floa
     assert max(high.max(), wide.max()) > 0.8
 
 
-def test_normals_of_a_box_point_out_of_it(simulation: Any) -> None:
-    vessel = simulation.vessel
-    normals = vertex_normals(np.asarray(vessel.vertices, float), vessel.faces)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-    middle = 0.5 * np.add(*vessel.bounds)
-    assert ((vessel.vertices - middle) * normals).sum(axis=1).min() > 0.0
+def test_recordings_of_different_vessels_share_no_camera(simulation: Any) -> None:
+    """Viewers keep camera and title by the application's id."""
+    names = {application_of(simulation)}
+    for change in ({"name": "other"}, {"title": "Another"}, {"gravity": (0.0, -9.81, 0.0)}):
+        other = FakeSimulation()
+        other.scene = msgspec.structs.replace(other.scene, **change)
+        names.add(application_of(other))  # type: ignore[arg-type]
+    moved = FakeSimulation()
+    moved.vessel = SimpleNamespace(vertices=2.0 * np.asarray(moved.vessel.vertices))  # type: ignore[assignment]
+    names.add(application_of(moved))  # type: ignore[arg-type]
+    assert len(names) == 5
+    assert application_of(FakeSimulation()) == application_of(simulation)  # type: ignore[arg-type]
