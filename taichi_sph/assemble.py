@@ -29,8 +29,11 @@ from taichi_sph.fluid.calibration import Calibration, calibrate
 from taichi_sph.fluid.equation_of_state import Tait
 from taichi_sph.fluid.rheology import make_rheology
 from taichi_sph.fluid.wcsph import Fluid
+from taichi_sph.geometry.filling import clear_of_proxies
+from taichi_sph.geometry.findings import BEYOND
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.geometry.vessel import Vessel
+from taichi_sph.geometry.wall_sampling import WallSample
 from taichi_sph.particles.grid import cells_within, make_grid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
@@ -44,8 +47,9 @@ SKIN = 0.1
 more candidates; from 0.12 on (2.24 d) it holds the lattice's next shell.  Of 0.02 to 0.3, PcNet
 runs A fastest with 0.1 and the physics, whose steps are short, is 7 % faster with 0.05 to 0.08."""
 
-OPENING_REACH = 2.5
-"""Blood beyond an opening's plane has left by it within this many radii of its centre."""
+OPENING_REACH = BEYOND
+"""Blood beyond an opening's plane has left by it within this many radii of its centre, or nearer
+where another branch passes."""
 
 PACKING = 1.1
 """Blood that flows in may pack the vessel closer than the lattice at the start by this factor."""
@@ -101,6 +105,36 @@ class _Plan:
         return buffer_regions(self.driven, self.spacing, self.kernel.support_radius).depth
 
 
+@dataclass(frozen=True, eq=False)
+class InitialState:
+    """Blood and proxies of a scene at the start, before there are any fields."""
+
+    blood: Floats
+    """Positions [m], (n, 3)."""
+    left_out: int
+    """Sites that hold no blood, for they are too near to a proxy."""
+    wall: WallSample
+    """Proxies of the vessel's wall."""
+    setback: float
+    """Of the proxies behind the lumen's surface [m]."""
+    proxies: Floats
+    """Those of the wall and of the flow extensions [m], (m, 3)."""
+    normals: Floats
+    """Unit normals out of the lumen, (m, 3)."""
+    amplitudes: Floats
+    """How far each moves with the wall [m], (m,)."""
+
+
+def initial_state(scene: Scene, vessel: Vessel, seed: int = 0) -> InitialState:
+    """Sample the wall and fill the column: what a simulation begins with.
+
+    Raises:
+        InputError: the column does not fit the vessel, or something that the scene names cannot be
+            used.
+    """
+    return _initial_state(_make_plan(scene, vessel), seed)
+
+
 def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
     """Sample the wall, fill the column and make all fields but those of a model.
 
@@ -109,17 +143,16 @@ def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
             used.
     """
     plan = _make_plan(scene, vessel)
-    proxies = _sample_proxies(plan, seed)
-    initial = _fill(plan)
-    derived = derive(scene, vessel, len(initial), len(proxies[0]))
+    start = _initial_state(plan, seed)
+    initial = start.blood
+    derived = derive(scene, vessel, len(initial), len(start.proxies))
     fluid = _make_fluid(plan, derived)
     particles = Particles.from_numpy(
         initial, mass=scene.blood.density * plan.spacing**3, room=_room(plan, len(initial))
     )
-    position, normal, amplitude = proxies
     wall = Wall.from_numpy(
-        position, normal, plan.kernel, plan.calibration.setback, plan.wall_spacing,
-        tool=0 if plan.tool is None else len(plan.tool.position), amplitude=amplitude,
+        start.proxies, start.normals, plan.kernel, start.setback, plan.wall_spacing,
+        tool=0 if plan.tool is None else len(plan.tool.position), amplitude=start.amplitudes,
     )  # fmt: skip
     neighbors = _make_neighbors(plan, particles.capacity, wall)
     blood = BloodFlow(particles, wall, neighbors, scene.gravity)
@@ -167,10 +200,28 @@ def make_driven_openings(scene: Scene, vessel: Vessel) -> list[DrivenOpening]:
     return driven
 
 
-def _sample_proxies(plan: _Plan, seed: int) -> tuple[Floats, Floats, Floats]:
-    """Proxies of wall and flow extensions: positions, normals, amplitudes, (m, 3), (m, 3), (m,)."""
+def _initial_state(plan: _Plan, seed: int) -> InitialState:
+    setback = plan.calibration.setback
+    sample = plan.vessel.sample_wall(plan.wall_spacing, setback, seed)
+    proxies, normals, amplitudes = _proxies(plan, sample)
+    blood = _fill(plan)
+    clear = clear_of_proxies(blood, proxies, plan.spacing, setback)
+    if not clear.any():
+        raise InputError(
+            f"column: no place at {plan.scene.column.opening!r} is far enough from the wall at "
+            f"spacing {plan.spacing:g} m; choose a finer spacing"
+        )
+    left_out = int((~clear).sum())
+    return InitialState(blood[clear], left_out, sample, setback, proxies, normals, amplitudes)
+
+
+def _proxies(plan: _Plan, sample: WallSample) -> tuple[Floats, Floats, Floats]:
+    """Proxies of wall and flow extensions: positions, normals, amplitudes, (m, 3), (m, 3), (m,).
+
+    Raises:
+        InputError: a flow extension runs into the lumen.
+    """
     vessel, setback = plan.vessel, plan.calibration.setback
-    sample = vessel.sample_wall(plan.wall_spacing, setback, seed)
     positions, normals = [sample.positions], [sample.normals]
     amplitudes = [np.zeros(len(sample.positions))]
     if plan.motion is not None:
@@ -181,6 +232,11 @@ def _sample_proxies(plan: _Plan, seed: int) -> tuple[Floats, Floats, Floats]:
         position, normal = flow_extension(
             rim, driven.opening, plan.wall_spacing, setback, plan.buffer_depth
         )
+        if vessel.contains(position).any():
+            raise InputError(
+                f"openings.{driven.opening.name}: another part of the lumen lies where blood is "
+                f"driven in, within {plan.buffer_depth:.3g} m beyond it; cut that end farther back"
+            )
         positions.append(position)
         normals.append(normal)
         amplitudes.append(np.zeros(len(position)))
@@ -246,9 +302,10 @@ def _make_boundaries(plan: _Plan, blood: BloodFlow) -> tuple[Boundary, ...]:
     far_end = (plan.layers + HYSTERESIS) * spacing
     for k, opening in enumerate(vessel.openings):
         if opening.is_open:
-            beyond = (far_end if scene.openings[opening.name].driven else 0.0) * opening.normal
-            end = opening.centre + beyond
-            outlets.open(k, end, end, opening.normal, OPENING_REACH * opening.radius)
+            beyond = far_end if scene.openings[opening.name].driven else 0.0
+            end = opening.centre + beyond * opening.normal
+            reach = vessel.clear_beyond(k, OPENING_REACH, beyond)
+            outlets.open(k, end, end, opening.normal, reach)
     tool = Tool(blood, plan.tool, plan.tool_position)
     boundaries: list[Boundary] = [
         outlets,

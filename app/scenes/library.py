@@ -14,10 +14,10 @@ from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, read_scene
 
 if TYPE_CHECKING:
+    from taichi_sph.assemble import InitialState
     from taichi_sph.derived import Derived
     from taichi_sph.geometry.findings import Finding
     from taichi_sph.geometry.vessel import Vessel
-    from taichi_sph.geometry.wall_sampling import WallSample
 
 
 WEIGHTS = "pcnet.npz"
@@ -136,22 +136,35 @@ def scenes_table() -> Table:
     return table
 
 
-def measure(scene: Scene) -> tuple["Vessel", "list[Finding]", "WallSample", "Derived"]:
+def measure(scene: Scene) -> tuple["Vessel", "list[Finding]", "InitialState", "Derived"]:
     """Read, check, sample and fill the vessel of a scene; the work behind `vesselflow info`.
 
     Raises:
         InputError: the surface cannot be used, or the column does not fit.
     """
+    from taichi_sph.assemble import initial_state
     from taichi_sph.derived import derive
-    from taichi_sph.geometry.findings import check_vessel
+    from taichi_sph.geometry.findings import (
+        Finding,
+        check_gaps,
+        check_gravity,
+        check_outlets,
+        check_vessel,
+    )
     from taichi_sph.geometry.vessel import read_vessel
 
     vessel = read_vessel(scene)
-    grid = scene.discretization
-    blood = vessel.fill_column(scene.column, grid.spacing)
-    wall = vessel.sample_wall(grid.wall_spacing_ratio * grid.spacing, 0.5 * grid.spacing)
-    derived = derive(scene, vessel, len(blood), len(wall.positions))
-    return vessel, check_vessel(vessel), wall, derived
+    spacing, column = scene.discretization.spacing, scene.column
+    start = initial_state(scene, vessel)
+    findings = check_vessel(vessel) + check_outlets(vessel)
+    findings += check_gaps(start.wall, spacing, start.setback)
+    if not column.full and not scene.openings[column.opening].driven:
+        findings += check_gravity(vessel, column.opening, scene.gravity)
+    if start.left_out:
+        text = f"{start.left_out} sites of the lattice hold no blood: too near to a wall's proxy"
+        findings.append(Finding(True, text))
+    derived = derive(scene, vessel, len(start.blood), len(start.proxies))
+    return vessel, findings, start, derived
 
 
 _OK, _NOTE = Text("ok", style="green"), Text("note", style="yellow")
@@ -172,7 +185,8 @@ def info_tables(scene: Scene) -> list[Table]:
     Raises:
         InputError: as `measure`.
     """
-    vessel, findings, wall, derived = measure(scene)
+    vessel, findings, start, derived = measure(scene)
+    wall = start.wall
     checks = _two_columns(f"{scene.name}: {scene.title}\nsurface {vessel.label}")
     for finding in findings:
         checks.add_row(_OK if finding.good else _NOTE, finding.text)

@@ -10,6 +10,8 @@ from taichi_sph.geometry.surface_file import where
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.geometry.wall_sampling import WallSample
 
+BEYOND = 2.5
+"""Blood beyond an opening's plane has left by it within so many radii of its middle."""
 STEEPEST = 30.0
 """Gravity farther off the way into the column's opening is said [degrees]: the top of the column
 then stands out of the opening by more than half its radius, and runs out."""
@@ -106,9 +108,27 @@ def check_gaps(wall: WallSample, spacing: float, setback: float) -> list[Finding
     ]
 
 
-def check_gravity(vessel: Vessel, opening: str, gravity: Floats) -> list[Finding]:
-    """What is said of gravity [m/s^2], (3,) that pulls blood out of its column's opening."""
-    end = vessel.opening(opening)
+def check_outlets(vessel: Vessel) -> list[Finding]:
+    """What is said of openings that another branch passes by.
+
+    Raises:
+        InputError: the lumen lies right beyond an opening.
+    """
+    findings = []
+    for k, opening in enumerate(vessel.openings):
+        clear = vessel.clear_beyond(k, BEYOND) if opening.is_open else np.inf
+        if clear < BEYOND * opening.radius:
+            text = f"another branch passes {1e3 * clear:.3g} mm beside opening {opening.name}: "
+            text += "blood farther from its middle has not left by it"
+            findings.append(Finding(True, text))
+    return findings
+
+
+def check_gravity(
+    vessel: Vessel, opening: str, acceleration: tuple[float, float, float]
+) -> list[Finding]:
+    """What is said of gravity [m/s^2] that pulls blood out of its column's opening."""
+    end, gravity = vessel.opening(opening), np.array(acceleration)
     g = float(np.linalg.norm(gravity))
     if g == 0.0 or not end.is_open:
         return []

@@ -15,7 +15,7 @@ from taichi_sph.geometry.mesh import Booleans, Floats, Integers
 WAY_ROUND = 10.0
 """What is nearer along the surface is the same crotch [spacings]: walls that part at 20 degrees are
 1.5 spacings from each other after a way of 9."""
-_ASIDE = 0.8
+_ASIDE = 1.2
 """Points straight across from each other are no farther aside [spacings]."""
 _THROUGH = 0.5
 """Walls that touch may cut a little through each other [spacings]; no lumen is as narrow."""

@@ -84,7 +84,7 @@ class Vessel:
         return Interior(*self.bounds, self.volume, self.signed_distance)
 
     @cached_property
-    def _clear(self) -> dict[tuple[int, float], float]:
+    def _clear(self) -> dict[tuple[int, float, float], float]:
         """What `clear_beyond` has found."""
         return {}
 
@@ -147,25 +147,32 @@ class Vessel:
         longest = max(loops, key=len)
         return self.vertices[longest]
 
-    def clear_beyond(self, number: int, radii: float) -> float:
+    def clear_beyond(self, number: int, radii: float, shift: float = 0.0) -> float:
         """How far from its middle, beyond opening `number`'s plane, nothing of the lumen lies [m].
 
         At most so many of its radii: another branch may pass by there, whose blood has not left.
 
+        Args:
+            number: Of the opening.
+            radii: The most that is looked at [radii of the opening].
+            shift: The plane is taken so far beyond the opening's [m].
+
         Raises:
             InputError: the lumen lies right beyond the opening.
         """
-        key = (number, radii)
+        key = (number, radii, shift)
         if key not in self._clear:
-            self._clear[key] = self._find_clear(number, radii * self.openings[number].radius)
+            self._clear[key] = self._find_clear(*key)
         return self._clear[key]
 
-    def _find_clear(self, number: int, most: float) -> float:
+    def _find_clear(self, number: int, radii: float, shift: float) -> float:
         opening = self.openings[number]
         corners = self.vertices[self._triangles]
         middles = corners.mean(axis=1)
         size = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-        apart = middles - opening.centre
+        most = radii * opening.radius
+        plane = opening.centre + shift * opening.normal
+        apart = middles - plane
         near = (np.linalg.norm(apart, axis=1) < most + size) & (apart @ opening.normal > -size)
         faces = self._triangles[near & (self.face_opening != number)]
         area = float(np.linalg.norm(mesh.face_vectors(self.vertices, faces), axis=1).sum())
@@ -173,8 +180,7 @@ class Vessel:
         if area == 0.0:
             return most
         grain = max(_GRAIN * opening.radius, math.sqrt(area / count))
-        apart = wall_sampling.stratified_points(self.vertices, faces, count, seed=0)
-        apart -= opening.centre
+        apart = wall_sampling.stratified_points(self.vertices, faces, count, seed=0) - plane
         beyond = apart[apart @ opening.normal > grain]
         closest = float(np.linalg.norm(beyond, axis=1).min(initial=np.inf)) - grain
         if closest >= most:
