@@ -28,13 +28,19 @@ def file_hash(path: Path) -> str:
     return found.hexdigest()
 
 
+def _file_kind(field: Any) -> str | None:
+    """What a field names a file of, as "surface"; None if it names none."""
+    extra = (field.type.extra or {}) if isinstance(field.type, inspect.Metadata) else {}
+    return extra.get("file")
+
+
 def _named(table: msgspec.Struct) -> Iterator[tuple[str, str]]:
     """Kind and name of each file that a table names, its own tables included."""
     for field in inspect.type_info(type(table)).fields:  # type: ignore[attr-defined]
         value: Any = getattr(table, field.name)
-        extra = (field.type.extra or {}) if isinstance(field.type, inspect.Metadata) else {}
-        if "file" in extra and value is not None:
-            yield extra["file"], value
+        kind = _file_kind(field)
+        if kind is not None and value is not None:
+            yield kind, value
         for each in value.values() if isinstance(value, dict) else [value]:
             if isinstance(each, msgspec.Struct):
                 yield from _named(each)
@@ -123,17 +129,23 @@ def with_files(scene: Scene, contents: dict[str, bytes], folder: Path) -> Scene:
         # Names may hold folders, or be alike but for them; the ending says what a file is.
         here[name] = f"{number}-{name.replace(chr(92), '/').rpartition('/')[2]}"
         (folder / here[name]).write_bytes(content)
-    change = msgspec.structs.replace
+    moved = _renamed(scene, here)
+    assert isinstance(moved, Scene)
+    return msgspec.structs.replace(moved, folder=str(folder))
 
-    def moved(table: Any, field: str) -> Any:
-        name = getattr(table, field)
-        return change(table, **{field: here.get(name, name)})
 
-    return change(
-        scene,
-        folder=str(folder),
-        vessel=moved(scene.vessel, "surface"),
-        openings={name: moved(table, "waveform") for name, table in scene.openings.items()},
-        tool=scene.tool and moved(scene.tool, "surface"),
-        wall=scene.wall and moved(scene.wall, "waveform"),
-    )
+def _renamed(table: msgspec.Struct, names: dict[str, str]) -> msgspec.Struct:
+    """A table that names its files otherwise, its own tables included."""
+    changes: dict[str, Any] = {}
+    for field in inspect.type_info(type(table)).fields:  # type: ignore[attr-defined]
+        value: Any = getattr(table, field.name)
+        if _file_kind(field) is not None:
+            changes[field.name] = names.get(value, value)
+        elif isinstance(value, msgspec.Struct):
+            changes[field.name] = _renamed(value, names)
+        elif isinstance(value, dict):
+            changes[field.name] = {
+                key: _renamed(each, names) if isinstance(each, msgspec.Struct) else each
+                for key, each in value.items()
+            }
+    return msgspec.structs.replace(table, **changes)

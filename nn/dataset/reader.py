@@ -99,17 +99,16 @@ class SceneFiles:
             InputError: a file that it names is missing, or differs from what was recorded.
         """
         contents = {}
-        for _, name in named_files(scene):
-            wanted = facts.surface_sha256 if name == scene.vessel.surface else facts.tool_sha256
+        for kind, name in named_files(scene):
+            wanted = facts.surface_sha256 if kind == "surface" else facts.tool_sha256
             if self._contents is not None and name in self._contents:
                 wanted = sha256(self._contents[name])
             beside = [place / name for place in self.places(facts)]
             there = next((path for path in beside if path.is_file()), None)
             content = there.read_bytes() if there is not None else None
             if content is not None and wanted and sha256(content) != wanted:
-                what = "surface" if name == scene.vessel.surface else "tool"
                 raise InputError(
-                    f"{self._path}: its {what} differs: {there} is not what was recorded; put that "
+                    f"{self._path}: its {kind} differs: {there} is not what was recorded; put that "
                     "back, move this dataset away from there, or record again"
                 )
             if self._contents is not None:
