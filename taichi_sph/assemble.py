@@ -21,6 +21,7 @@ from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.boundary.suction import Suction
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.boundary.tool_surface import ToolSurface, read_tool_surface
+from taichi_sph.boundary.tracer import DYE, Tracer
 from taichi_sph.boundary.wall_motion import MovingWall, WallMotion, read_wall_motion
 from taichi_sph.boundary.wounds import MOST_WOUNDS, Wounds
 from taichi_sph.derived import Derived, derive
@@ -148,8 +149,9 @@ def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
     derived = derive(scene, vessel, len(initial), len(start.proxies))
     fluid = _make_fluid(plan, derived)
     particles = Particles.from_numpy(
-        initial, mass=scene.blood.density * plan.spacing**3, room=_room(plan, len(initial))
-    )
+        initial, mass=scene.blood.density * plan.spacing**3, room=_room(plan, len(initial)),
+        more=(DYE,),
+    )  # fmt: skip
     wall = Wall.from_numpy(
         start.proxies, start.normals, plan.kernel, start.setback, plan.wall_spacing,
         tool=0 if plan.tool is None else len(plan.tool.position), amplitude=start.amplitudes,
@@ -307,13 +309,15 @@ def _make_boundaries(plan: _Plan, blood: BloodFlow) -> tuple[Boundary, ...]:
             reach = vessel.clear_beyond(k, OPENING_REACH, beyond)
             outlets.open(k, end, end, opening.normal, reach)
     tool = Tool(blood, plan.tool, plan.tool_position)
+    inflow = BufferZones(
+        blood, plan.driven, spacing, plan.kernel.support_radius, scene.blood.density
+    )
     boundaries: list[Boundary] = [
         outlets,
         tool,
         Suction(blood, outlets, tool, spacing),
-        BufferZones(
-            blood, plan.driven, spacing, plan.kernel.support_radius, scene.blood.density
-        ),
+        inflow,
+        Tracer(blood, inflow),
         Wounds(blood, vessel, outlets, len(vessel.openings), plan.kernel, spacing),
     ]  # fmt: skip
     if plan.motion is not None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, U
 import msgspec
 import numpy as np
 
+from taichi_sph.boundary.tracer import Tracer
 from taichi_sph.errors import InputError
 
 if TYPE_CHECKING:
@@ -219,8 +220,39 @@ class Clamp(Command, frozen=True, tag="clamp"):
         return self
 
 
+class Dye(Command, frozen=True, tag="dye"):
+    """Mark blood with a contrast medium: a ball of it, or what comes in through an opening."""
+
+    centre: Vector | None = None
+    """Middle of the ball [m]."""
+    radius: Positive | None = None
+    """Radius of the ball [m]."""
+    opening: str | None = None
+    """Driven opening, in place of a ball: all blood that comes in by it from now on is marked."""
+    concentration: Annotated[float, msgspec.Meta(ge=0, le=1)] = 1.0
+    """Concentration over that of the medium as injected; 0 takes the dye away."""
+
+    def check(self, session: CommandedSession) -> None:
+        """Refuse what is neither a ball nor a driven opening."""
+        is_ball = self.centre is not None and self.radius is not None
+        if is_ball == (self.opening is not None) or (self.centre is None) != (self.radius is None):
+            raise InputError("dye: give centre and radius [m], or an opening, one of the two")
+        if self.opening is not None and self.opening not in session.driven:
+            allowed = ", ".join(session.driven) or "none"
+            raise InputError(f"dye: no blood comes in through {self.opening!r}; driven: {allowed}")
+
+    def apply(self, session: CommandedSession) -> Command:
+        """Mark it."""
+        tracer = session.simulation.boundary(Tracer)
+        if self.opening is not None:
+            tracer.mark_inflow(self.opening, self.concentration)
+        elif self.centre is not None and self.radius is not None:
+            tracer.mark_ball(np.array(self.centre), self.radius, self.concentration)
+        return self
+
+
 class Reset(Command, frozen=True, tag="reset"):
-    """Put blood, wounds, tool and gravity back to the start; the clock goes on."""
+    """Put blood, wounds, dye, tool and gravity back to the start; the clock goes on."""
 
     def apply(self, session: CommandedSession) -> Command:
         """Put them back."""
@@ -230,7 +262,7 @@ class Reset(Command, frozen=True, tag="reset"):
 
 
 COMMANDS: tuple[type[Command], ...] = (
-    Pause, Step, Speed, Gravity, Inflow, Model, Tool, Suction, Wound, Clamp, Reset,
+    Pause, Step, Speed, Gravity, Inflow, Model, Tool, Suction, Wound, Clamp, Dye, Reset,
 )  # fmt: skip
 """All commands.  The names, the parser, the page's controls and the documentation follow it."""
 NAMES = tuple(str(command.__struct_config__.tag) for command in COMMANDS)

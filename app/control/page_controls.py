@@ -11,6 +11,7 @@ from app.control.commands import (
     LARGEST_FACTOR,
     Clamp,
     Command,
+    Dye,
     Gravity,
     Inflow,
     Model,
@@ -171,6 +172,26 @@ def add_clamp(panel: Panel) -> None:
     panel.wish(button, lambda: Clamp(wound=None if which.value == every else int(which.value)))
 
 
+def add_dye(panel: Panel) -> None:
+    """Buttons that mark blood inside the wall at the marker, and blood that comes in."""
+    simulation, marker = panel.session.simulation, panel.scene.wound_marker
+    spacing = simulation.scene.discretization.spacing
+    radius = panel.gui.add_number(
+        "dye radius [mm]", round(6.0 * MM * spacing, 1), min=round(MM * spacing, 2), step=0.1
+    )
+    ball = panel.gui.add_button("Dye here", color="cyan")
+    panel.wish(ball, lambda: Dye(centre=vector(marker.position), radius=radius.value / MM))
+    if panel.session.driven:
+        opening = panel.gui.add_dropdown("dye what enters by", tuple(panel.session.driven))
+        for label, concentration in (("Dye inflow", 1.0), ("Clear inflow", 0.0)):
+            _add_inflow_dye(panel, label, opening, concentration)
+
+
+def _add_inflow_dye(panel: Panel, label: str, opening: Any, concentration: float) -> None:
+    button = panel.gui.add_button(label)
+    panel.wish(button, lambda: Dye(opening=opening.value, concentration=concentration))
+
+
 def always(session: "Session") -> bool:
     """Whether a control is shown that every session has."""
     return True
@@ -197,6 +218,7 @@ CONTROLS = (
     Control("Tool and suction", (Suction,), add_suction),
     Control("Wound", (Wound,), add_wound),
     Control("Wound", (Clamp,), add_clamp),
+    Control("Dye", (Dye,), add_dye),
 )
 """Controls in the order of the page, those of a folder together."""
 NO_CONTROL: dict[type[Command], str] = {}

@@ -8,14 +8,13 @@ import numpy as np
 
 from app.view.appearance import (
     BACKGROUND,
-    COLOURS,
     FIELD_OF_VIEW,
     SPEED_COLOURS,
     TOOL_COLOUR,
     WALL_COLOUR,
     WOUND_COLOUR,
+    blood_colours,
     eye,
-    speed_levels,
     upward,
 )
 from taichi_sph.geometry.mesh import Floats, Integers
@@ -170,7 +169,7 @@ class PageScene:
 
     def show_blood(self, frame: "ViewFrame") -> None:
         """Show another frame."""
-        colours = COLOURS[speed_levels(frame.velocities, self.full_scale)]
+        colours = blood_colours(frame.velocities, self.full_scale, frame.dye)
         self._blood.points, self._blood.colors = frame.positions, colours
         if len(frame.droplets) or len(self._droplets.points):
             self._droplets.points = frame.droplets

@@ -23,6 +23,7 @@ from app.control.log import (
 )
 from app.files import check_output
 from app.models import MODELS
+from taichi_sph.boundary.tracer import Tracer
 from taichi_sph.errors import InputError, RunError
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ class ViewFrame:
     """[m/s], (n, 3)."""
     droplets: np.ndarray
     """Blood that has left through wounds [m], (m, 3)."""
+    dye: np.ndarray
+    """Concentration of the dye [-], (n,)."""
 
 
 class _Waiting(NamedTuple):
@@ -220,8 +223,9 @@ class Session:
         simulation = self.simulation
         _, position, velocity = simulation.particles.live()
         self._latest_frame = ViewFrame(
-            simulation.time, position, velocity, simulation.outlets.droplets()
-        )
+            simulation.time, position, velocity, simulation.outlets.droplets(),
+            simulation.boundary(Tracer).dye.to_numpy()[: len(position)],
+        )  # fmt: skip
         self._viewed, self.frame_requested = clock.perf_counter(), False
 
     def _drain(self, held: bool = False) -> None:

@@ -24,6 +24,8 @@ lightness rises evenly, so that equal differences of speed look equal."""
 WALL_COLOUR = (0xE0, 0x98, 0x90, 0x2A)
 TOOL_COLOUR = (0xC8, 0xD2, 0xDC, 0xFF)
 DROP_COLOUR = (0x96, 0x14, 0x14)
+DYE_COLOUR = (0x1E, 0xC8, 0xF0)
+"""Cyan: no speed has it."""
 WOUND_COLOUR = (0xFF, 0xE0, 0x60, 0xFF)
 """Red, green, blue, opacity."""
 BACKGROUND = (14, 16, 20)
@@ -55,6 +57,24 @@ def speed_levels(velocities: NDArray[np.floating], full_scale: float) -> NDArray
     last = len(COLOURS) - 1
     # Not finite, it is shown as the fastest.
     return np.fmin(speed * (last / full_scale), last).astype(np.uint8)
+
+
+def blood_colours(
+    velocities: NDArray[np.floating], full_scale: float, dye: NDArray[np.floating]
+) -> NDArray[np.uint8]:
+    """Red, green, blue of blood, (n, 3): of its speed, and towards DYE_COLOUR as it is dyed.
+
+    Args:
+        velocities: [m/s], (n, 3).
+        full_scale: speed of the brightest colour [m/s].
+        dye: concentration, 0 to 1, (n,).
+    """
+    colours = COLOURS[speed_levels(velocities, full_scale)]
+    if dye.any():
+        part = np.clip(dye, 0.0, 1.0)[:, None]
+        mixed = (1.0 - part) * colours + part * np.array(DYE_COLOUR, float)
+        colours = np.rint(mixed).astype(np.uint8)
+    return colours
 
 
 def upward(gravity: tuple[float, float, float]) -> Floats:

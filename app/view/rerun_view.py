@@ -23,6 +23,7 @@ from app.view.appearance import (
     TOOL_COLOUR,
     WALL_COLOUR,
     WOUND_COLOUR,
+    blood_colours,
     eye,
     speed_levels,
     upward,
@@ -36,6 +37,7 @@ from app.view.rerun_streams import (
     open_stream,
     send,
 )
+from taichi_sph.boundary.tracer import Tracer
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import vertex_normals
 
@@ -320,7 +322,10 @@ class RerunView:
         items, self._notes = self._notes, []
         if frame % self.every == 0:
             position, velocity = simulation.positions_and_velocities()
-            colours = PACKED_COLOURS[speed_levels(velocity, self.full_scale)]
+            dye = simulation.particles.in_order(simulation.boundary(Tracer).dye)
+            colours: Any = PACKED_COLOURS[speed_levels(velocity, self.full_scale)]
+            if dye.any():
+                colours = blood_colours(velocity, self.full_scale, dye)
             items.append(("world/blood", rr.Points3D(position, colors=colours)))
             items += self._surgery(simulation)
             if self._wall is not None:

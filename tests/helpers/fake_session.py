@@ -156,4 +156,5 @@ class FakeSession:
             positions=position,
             velocities=(np.abs(swirl) * [0.0, 0.0, 1.0]).astype(np.float32),
             droplets=self.droplets.astype(np.float32),
+            dye=np.zeros(len(self.positions), np.float32),
         )

@@ -15,6 +15,7 @@ from app.control.commands import (
     NAMES,
     Clamp,
     Command,
+    Dye,
     Gravity,
     Inflow,
     Model,
@@ -51,6 +52,7 @@ EXAMPLES: dict[type[Command], Command] = {
     Suction: Suction(rate=2e-5, radius=0.002),
     Wound: Wound(centre=WALL, radius=0.002),
     Clamp: Clamp(wound=0),
+    Dye: Dye(centre=(0.0, 0.0, 0.005), radius=0.004, concentration=0.5),
     Reset: Reset(),
 }
 """One of each, in the order in which a session can do them."""
@@ -210,3 +212,18 @@ def test_without_driven_openings_there_is_no_inflow(session: Session) -> None:
     session.driven = []
     with pytest.raises(InputError, match="nothing drives this scene"):
         session.submit(as_dict(Inflow(factor=1.0)), "test")
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({}, "give centre and radius"),
+        ({"centre": [0, 0, 0]}, "give centre and radius"),
+        ({"centre": [0, 0, 0], "radius": 0.002, "opening": "top"}, "one of the two"),
+        ({"opening": "side"}, "'side'; driven: top, bottom"),
+        ({"opening": "top", "concentration": 2.0}, "concentration"),
+    ],
+)
+def test_a_dye_that_says_not_where_is_refused_at_once(session, keys, says) -> None:
+    with pytest.raises(InputError, match=says):
+        session.submit({"command": "dye", **keys}, "test")

@@ -380,7 +380,7 @@ def test_a_ray_hits_what_it_meets_and_nothing_else(session: Any) -> None:
             hits += 1
             # Single precision in libigl.
             np.testing.assert_allclose(found, start + expected * way, atol=1e-6)
-    assert 8 < hits < 0.5 * len(ways), "some hit and most miss"
+    assert 4 < hits < 0.5 * len(ways), "some hit and most miss"
 
 
 @needs_viser
@@ -540,6 +540,16 @@ def use_every_control(browser: Browser, page: ControlPage, session: Any) -> None
     browser.choose("which", "all")
     browser.press("Clamp")
     latest("clamp", lambda c: "wound" not in c)
+
+    browser.enter("dye radius [mm]", 3.5)
+    browser.press("Dye here")
+    assert latest("dye")["radius"] == pytest.approx(3.5e-3)
+    np.testing.assert_allclose(latest("dye")["centre"], page.wound_marker.position)
+    browser.choose("dye what enters by", session.driven[1])
+    browser.press("Dye inflow")
+    last("dye", opening=session.driven[1], concentration=1.0)
+    browser.press("Clear inflow")
+    last("dye", opening=session.driven[1], concentration=0.0)
 
     # A click beside the vessel leaves the marker where it is.
     before = np.array(page.wound_marker.position)

@@ -19,6 +19,7 @@ from app.view import rerun_streams
 from app.view.appearance import (
     ASPECT,
     COLOURS,
+    DYE_COLOUR,
     FIELD_OF_VIEW,
     PACKED_COLOURS,
     SPEED_COLOURS,
@@ -384,3 +385,17 @@ def test_recordings_of_different_vessels_share_no_camera(simulation: Any) -> Non
     names.add(application_of(moved))  # type: ignore[arg-type]
     assert len(names) == 5
     assert application_of(FakeSimulation()) == application_of(simulation)  # type: ignore[arg-type]
+
+
+def test_dyed_blood_has_the_colour_of_the_dye_as_far_as_it_is_dyed(
+    simulation: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "run.rrd"
+    simulation.dye[:3] = 1.0, 0.5, 0.0
+    drive(simulation, [RerunView(simulation, file)], until=0.01, frame_interval=0.01)
+    packed = rows(file, "/world/blood", "Points3D:colors")[1]
+    colours = np.array([[c >> shift & 0xFF for shift in (24, 16, 8)] for c in packed])
+    at_speed = COLOURS[speed_levels(simulation.velocity, 1.0)].astype(float)
+    np.testing.assert_array_equal(colours[0], DYE_COLOUR)
+    np.testing.assert_allclose(colours[1], 0.5 * (at_speed[1] + DYE_COLOUR), atol=0.5)
+    np.testing.assert_array_equal(colours[2:], at_speed[2:])

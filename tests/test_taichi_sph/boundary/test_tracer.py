@@ -1,0 +1,95 @@
+"""Dye: which blood is marked, that the mark stays with its particle, and what is refused."""
+
+import numpy as np
+import pytest
+
+from driven_tube import LENGTH, OF_ONE, D
+from taichi_sph.boundary.tracer import Tracer
+from taichi_sph.errors import InputError
+from taichi_sph.simulation import Simulation
+
+
+def tracer_of(sim: Simulation) -> Tracer:
+    return sim.boundary(Tracer)
+
+
+def dye_of(sim: Simulation) -> dict[int, float]:
+    """Concentration by identity."""
+    rows = sim.particles.rows()
+    return dict(zip(rows["identity"].tolist(), rows["dye"].tolist(), strict=True))
+
+
+def test_a_ball_of_blood_is_marked_and_each_particle_keeps_its_mark(driven):
+    driven.advance_to(0.01)
+    rows, centre, radius = driven.particles.rows(), np.array([1e-3, 0.0, -1e-3]), 2.0 * D
+    inside = np.linalg.norm(rows["position"] - centre, axis=1) < radius
+    assert tracer_of(driven).mark_ball(centre, radius, 0.75) == inside.sum() > 10
+    expected = {int(i): 0.75 * float(m) for i, m in zip(rows["identity"], inside, strict=True)}
+    assert dye_of(driven) == expected
+    # Rows are sorted anew meanwhile, blood is added and leaves.
+    driven.advance_to(0.06)
+    assert driven.inflow.added > 0
+    assert dye_of(driven) == {i: expected.get(i, 0.0) for i in dye_of(driven)}
+
+
+def test_what_comes_in_is_marked_from_now_on_and_as_much_as_comes_in(driven):
+    driven.advance_to(0.08)
+    rows = driven.particles.rows()
+    inside = set(rows["identity"][rows["position"][:, 2] < 0.5 * LENGTH].tolist())
+    pump = next(p for p in driven.inflow.openings if p.opening.name == "top")
+    before = pump.volume_in
+    tracer_of(driven).mark_inflow("top")
+    driven.advance_to(0.12)
+    dye, rows = dye_of(driven), driven.particles.rows()
+    assert not any(dye[i] for i in inside & dye.keys()), "what was in the vessel is as it was"
+    there = rows["identity"][np.abs(rows["position"][:, 2]) < 0.5 * LENGTH]
+    crossed = set(there.tolist()) - inside
+    assert all(dye[i] == 1.0 for i in crossed)
+    # The strands cross one after the other: within a layer of them.
+    strands = len(pump.sites)
+    assert len(crossed) == pytest.approx((pump.volume_in - before) / OF_ONE, abs=strands)
+    assert len(crossed) > 2 * strands
+
+
+def test_clear_blood_may_follow_dye(driven):
+    tracer_of(driven).mark_inflow("top")
+    driven.advance_to(0.06)
+    tracer_of(driven).mark_inflow("top", 0.0)
+    first_clear = driven.inflow.next_identity
+    driven.advance_to(0.1)
+    dye = dye_of(driven)
+    assert all(dye[i] == 0.0 for i in dye if i >= first_clear)
+    assert any(dye[i] == 1.0 for i in dye)
+
+
+def test_a_state_keeps_dye_and_where_it_comes_in_and_a_reset_clears_both(driven):
+    driven.advance_to(0.01)
+    tracer_of(driven).mark_inflow("top", 0.5)
+    tracer_of(driven).mark_ball(np.zeros(3), 2.0 * D)
+    state = driven.save_state()
+    driven.advance_to(0.05)
+    first = driven.save_state().particles
+    driven.reset()
+    assert not any(dye_of(driven).values())
+    driven.advance_to(driven.time + 0.02)
+    assert not any(dye_of(driven).values()), "nothing comes in marked"
+    driven.load_state(state)
+    driven.advance_to(0.05)
+    again = driven.save_state().particles
+    assert again["dye"].any() and again["dye"].tobytes() == first["dye"].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda t: t.mark_inflow("side"), "'side'; driven: top, bottom"),
+        (lambda t: t.mark_ball(np.array([1.0, 0.0, 0.0]), 1e-3), "no blood is within 0.001 m"),
+        (lambda t: t.mark_ball(np.zeros(3), 1e-2, 1.5), "concentration of 1.5; allowed: 0 to 1"),
+        (lambda t: t.mark_inflow("top", float("nan")), "concentration of nan; allowed: 0 to 1"),
+    ],
+)
+def test_what_cannot_be_marked_is_refused_and_nothing_changes(driven, ask, says):
+    with pytest.raises(InputError, match="dye: ") as refused:
+        ask(tracer_of(driven))
+    assert says in str(refused.value)
+    assert not any(dye_of(driven).values()) and not tracer_of(driven).in_use
