@@ -1,5 +1,6 @@
 # make run       install into .venv and pour blood into the aorta and its iliac arteries
 # make test      install, lint, type-check, run the tests
+# make validation  run the slow proofs too (pytest -m validation)
 # make validate  compare the physics with theory (minutes)
 
 PYTHON ?= python3
@@ -11,7 +12,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 INSTALLED := .venv/.installed
 DEVELOPS := .venv/.installed-dev
 
-.PHONY: run test validate lint clean
+.PHONY: run test validation validate lint clean
 .DEFAULT_GOAL := run
 
 run: $(INSTALLED)
@@ -20,6 +21,9 @@ run: $(INSTALLED)
 
 test: lint
 	$(BIN)/pytest --numprocesses 2 --dist loadfile --durations=25
+
+validation: $(DEVELOPS)
+	$(BIN)/pytest -m validation --durations=25
 
 lint: $(DEVELOPS)
 	$(BIN)/ruff check .
