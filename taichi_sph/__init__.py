@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from taichi_sph.scene import Scene as Scene
     from taichi_sph.scene import read_scene as read_scene
     from taichi_sph.simulation import Simulation as Simulation
-    from taichi_sph.simulation import State as State
+    from taichi_sph.state import State as State
 
 _HOMES = {
     "AccelerationModel": "fluid.wcsph",
@@ -27,7 +27,7 @@ _HOMES = {
     "RunError": "errors",
     "Scene": "scene",
     "Simulation": "simulation",
-    "State": "simulation",
+    "State": "state",
     "float_dtype": "runtime",
     "implicit": "models",
     "physics": "models",

@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import ctypes
 import os
 import shutil
 import tempfile
@@ -71,6 +72,21 @@ def require_runtime(number: int) -> None:
         )
 
 
+def finish_fields() -> None:
+    """Give all fields that were made their memory, which only the thread of `start` can do."""
+    ti.sync()
+
+
+def _abandon_fork() -> None:
+    """Leave Taichi in memory in a fork: taking it down would wait for threads that are not there."""
+    if _started is not None:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))
+
+
+if hasattr(os, "register_at_fork"):  # where processes can be forked
+    os.register_at_fork(after_in_child=_abandon_fork)
+
+
 def float_dtype() -> type[np.floating]:
     """The numpy type of a kernel's `float`."""
     return np.float32 if ti.cfg.default_fp == ti.f32 else np.float64
@@ -131,14 +147,15 @@ def _temporary_cache() -> str:
             "no folder can be written for compiled kernels; let TI_OFFLINE_CACHE_FILE_PATH name "
             f"one ({error.strerror})"
         ) from None
-    atexit.register(_leave, folder)
+    atexit.register(_leave, folder, os.getpid())
     return folder
 
 
-def _leave(folder: str) -> None:
-    """End Taichi, which writes its kernels then, and remove them."""
-    ti.reset()
-    shutil.rmtree(folder, ignore_errors=True)
+def _leave(folder: str, process: int) -> None:
+    """End Taichi, which writes its kernels then, and remove them; a fork leaves them alone."""
+    if os.getpid() == process:
+        ti.reset()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def start(

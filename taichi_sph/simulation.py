@@ -20,7 +20,7 @@ from taichi_sph.errors import InputError, RunError
 from taichi_sph.fluid.wcsph import AccelerationModel, Fluid, SphAcceleration
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.integrator import kick_drift, largest_speed_and_acceleration
-from taichi_sph.runtime import require_runtime, runtime_number
+from taichi_sph.runtime import finish_fields, require_runtime, runtime_number
 from taichi_sph.scene import Scene
 from taichi_sph.state import State
 
@@ -77,6 +77,7 @@ class Simulation:
         self._assembly = assembly
         self._inflow = self._find(BufferZones)
         self._runtime = runtime_number()
+        finish_fields()
 
     @classmethod
     def from_scene(
@@ -292,7 +293,9 @@ class Simulation:
         """
         self._require_runtime()
         runtime_number()
-        return make_model(self.fluid, self.particles.capacity)
+        model = make_model(self.fluid, self.particles.capacity)
+        finish_fields()
+        return model
 
     def compile_kernels(self, models: Sequence[AccelerationModel]) -> None:
         """Have models and boundaries compile what they need, before anybody waits for it.
@@ -339,6 +342,7 @@ class Simulation:
     @property
     def wall_motion(self) -> MovingWall | None:
         """What moves the vessel's wall; None where it stands still."""
+        self._require_runtime()
         return self._find(MovingWall)
 
     def boundary(self, kind: type[AnyBoundary]) -> AnyBoundary:
@@ -346,7 +350,9 @@ class Simulation:
 
         Raises:
             LookupError: there is none, as without a scene.
+            RunError: it was made before the last `start`.
         """
+        self._require_runtime()
         boundary = self._find(kind)
         if boundary is None:
             raise LookupError(f"this simulation has no {kind.__name__}")
