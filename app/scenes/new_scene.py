@@ -14,7 +14,7 @@ from app.scenes.smoothing import smoothed
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.caps import BULGE
-from taichi_sph.geometry.findings import crossings, text_of
+from taichi_sph.geometry.findings import LARGEST_RADIUS, LARGEST_VOLUME, crossings, text_of
 from taichi_sph.geometry.mending import largest_piece, mend
 from taichi_sph.geometry.mesh import Floats, Integers
 from taichi_sph.geometry.openings import Ends, close_holes, find_openings
@@ -29,10 +29,6 @@ from taichi_sph.scene import OpeningTable
 
 METRES, MILLIMETRES, MICROMETRES = 1.0, 1e-3, 1e-6
 """Units that are guessed, in metres."""
-LARGEST_RADIUS = 0.05
-"""No opening of a vessel is wider [m]: an aneurysm of the aorta that has to be mended has half."""
-LARGEST_VOLUME = 1e-3
-"""And no lumen holds more [m^3]: the whole aorta holds a quarter of it."""
 
 
 def create_scene(

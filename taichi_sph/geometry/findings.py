@@ -10,6 +10,10 @@ from taichi_sph.geometry.surface_file import where
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.geometry.wall_sampling import WallSample
 
+LARGEST_RADIUS = 0.05
+"""No opening of a vessel is wider [m]: an aneurysm of the aorta that has to be mended has half."""
+LARGEST_VOLUME = 1e-3
+"""And no lumen holds more [m^3]: the whole aorta holds a quarter of it."""
 BEYOND = 2.5
 """Blood beyond an opening's plane has left by it within so many radii of its middle."""
 STEEPEST = 30.0
@@ -65,6 +69,9 @@ def check_vessel(vessel: Vessel) -> list[Finding]:
         Finding(True, f"narrowest place {1e3 * vessel.narrowest:.2f} mm"),
         *(Finding(True, note) for note in vessel.notes),
     ]
+    widest = max((opening.radius for opening in vessel.openings), default=0.0)
+    if widest > LARGEST_RADIUS or vessel.volume > LARGEST_VOLUME:
+        findings.append(Finding(False, "no vessel is so large; is vessel.scale right?"))
     for opening in vessel.openings:
         state = "open" if opening.is_open else "capped"
         findings.append(

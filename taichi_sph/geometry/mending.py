@@ -15,9 +15,9 @@ from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
 
-NEAR = 5e-5
+NEAR = 3e-4
 """Corners on open edges so near to another, over the surface's size, are one: six digits, which C++
-writes by default, of a place that is twenty sizes from the origin."""
+writes by default, of a place thirty sizes from the origin, as in a scanner's coordinates."""
 OF_AN_EDGE = 0.1
 """But never farther from it than this part of the shortest open edge: what is modelled stays."""
 GRAIN = 1e-7

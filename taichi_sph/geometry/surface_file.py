@@ -57,9 +57,8 @@ def load_surface(path: Path) -> tuple[Floats, Integers]:
         polygons = READERS[kind](data)
         faces = triangulate(polygons)
     except FormatError as error:
-        raise InputError(
-            f"{path}: not a readable {kind} surface: {error}; allowed: {FORMATS}"
-        ) from None
+        allowed = "" if "allowed:" in str(error) else f"; allowed: {FORMATS}"
+        raise InputError(f"{path}: not a readable {kind} surface: {error}{allowed}") from None
     vertices = polygons.points
     if len(faces) == 0 or len(vertices) == 0:
         raise InputError(f"{path}: the surface has no triangles; a closed or open tube is needed")

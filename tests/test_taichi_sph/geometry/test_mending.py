@@ -32,10 +32,11 @@ def shaken(by: float) -> Mesh:
     return vertices + np.random.default_rng(0).uniform(-by, by, vertices.shape), faces
 
 
-def rounded(digits: int) -> Mesh:
+def rounded(digits: int, higher: float = 0.0) -> Mesh:
     """Wall and caps by two programs, one of which writes so many digits."""
-    caps = np.array([[float(f"{x:.{digits}g}") for x in v] for v in V + SCANNER])
-    return np.concatenate([V + SCANNER, caps]), np.concatenate([F[:144], F[144:] + len(V)])
+    place = V + SCANNER + [0, 0, higher]
+    caps = np.array([[float(f"{x:.{digits}g}") for x in v] for v in place])
+    return np.concatenate([place, caps]), np.concatenate([F[:144], F[144:] + len(V)])
 
 
 def one_float_apart() -> Mesh:
@@ -96,6 +97,7 @@ def with_corner_on_edge() -> Mesh:
         (lambda: shaken(1e-5 * SIZE / 4), 168, "joined"),
         (lambda: rounded(6), 168, "joined: 16 corners"),
         (lambda: rounded(7), 168, "joined"),
+        (lambda: rounded(6, 500.0), 168, "joined"),
         (lambda: with_faces(*F[40:45].tolist()), 168, "left out: 5 triangles given twice"),
         (lambda: with_faces(*F[40:45, ::-1].tolist()), 168, "left out: 5 triangles given twice"),
         (lambda: with_faces(*F[40:45, [1, 2, 0]].tolist()), 168, "5 triangles given twice"),
@@ -118,8 +120,8 @@ def test_what_others_leave_behind_is_mended_and_said(
     assert mesh.is_closed(faces)
     assert mesh.is_winding_consistent(faces)
     require_manifold(vertices, faces, "my.stl")
-    # What was joined moved by 5e-5 of the size at most.
-    assert mesh.enclosed_volume(vertices, faces) == pytest.approx(VOLUME, rel=5e-5)
+    # What was joined moved by 0.005 of 40 at most, at the ends.
+    assert mesh.enclosed_volume(vertices, faces) == pytest.approx(VOLUME, rel=2e-4)
     assert words in "; ".join(notes)
     assert bool(notes) is bool(words)
 
@@ -170,11 +172,11 @@ def test_a_sliver_that_closes_the_surface_stays() -> None:
     assert notes == []
 
 
-@pytest.mark.parametrize("digits", [4, 5])
+@pytest.mark.parametrize("digits", [3, 4])
 def test_patches_too_far_apart_are_refused_with_the_gap(digits: int) -> None:
     vertices, faces, _ = mend(*rounded(digits), "my.stl")
     # Half a unit of the last digit before the point and behind, along three axes.
-    with pytest.raises(InputError, match=r"corners on open edges lie within 0\.0.*weld them"):
+    with pytest.raises(InputError, match=r"corners on open edges lie within 0.*weld them"):
         require_manifold(vertices, faces, "my.stl")
 
 

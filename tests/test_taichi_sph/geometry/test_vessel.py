@@ -141,6 +141,15 @@ def test_centres_are_in_units_of_the_file() -> None:
     assert np.abs(vessel.openings[0].centre - TOP).max() < 1e-7
 
 
+def test_a_size_that_no_vessel_has_is_a_finding() -> None:
+    vertices, faces = cylinder()
+    for larger, told in ((1.0, False), (7.0, False), (20.0, True)):
+        openings = {"top": OpeningTable(centre=(0.0, 0.0, TOP[2] * larger))}
+        vessel = build_vessel(vertices * larger, faces, openings, 1.0, "tube")
+        lines = [f.text for f in check_vessel(vessel) if not f.good]
+        assert ("no vessel is so large; is vessel.scale right?" in lines) is told
+
+
 def test_an_oblique_end_is_an_opening() -> None:
     vertices, faces = cylinder()
     vertices[:, 2] += 0.5 * vertices[:, 0]
