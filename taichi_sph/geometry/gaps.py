@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from taichi_sph.geometry import mesh
+from taichi_sph.geometry.closed_surface import ClosedSurface
 from taichi_sph.geometry.mesh import Booleans, Floats, Integers
 
 WAY_ROUND = 10.0
@@ -23,16 +24,16 @@ _CHUNK = 64
 
 
 def gaps_at(
-    vertices: Floats, faces: Integers, points: Floats, on: Integers, normals: Floats,
+    surface: ClosedSurface, faces: Integers, points: Floats, on: Integers, normals: Floats,
     spacing: float, most: float,
 ) -> Floats:  # fmt: skip
     """Width of the gap outside the wall at points on it [m], (k,); infinite where there is none.
 
     Args:
-        vertices: Of the surface (n, 3) [m].
-        faces: Its triangles (m, 3).
-        points: On the surface, evenly (k, 3) [m].
-        on: The triangle of each (k,).
+        surface: The lumen's [m].
+        faces: Triangles of its vertices that are wall (m, 3).
+        points: On them, evenly (k, 3) [m].
+        on: The triangle of the wall that each is on (k,).
         normals: Unit normals out of the lumen (k, 3).
         spacing: Of the points [m].
         most: Wider gaps are none [m].
@@ -49,10 +50,32 @@ def gaps_at(
     i, j, width = i[across], j[across], np.maximum(np.minimum(ahead, back)[across], 0.0)
     near = width < most
     i, j, width = i[near], j[near], width[near]
-    far = _far_round(vertices, faces, on[i], on[j], WAY_ROUND * spacing)
+    far = _far_round(surface.vertices, faces, on[i], on[j], WAY_ROUND * spacing)
     for end in (i, j):
         np.minimum.at(gaps, end[far], width[far])
+    rows = np.flatnonzero(np.isfinite(gaps))
+    gaps[rows] = _across(surface, points[rows], normals[rows], gaps[rows], spacing)
+    gaps[gaps >= most] = np.inf
     return gaps
+
+
+def _across(
+    surface: ClosedSurface, points: Floats, normals: Floats, about: Floats, spacing: float
+) -> Floats:
+    """Distance from points to the other side of a gap [m], (k,), from what it is `about` [m].
+
+    Points are never quite opposite; from beyond half-way the other side itself is the nearest.
+    """
+    facing = mesh.unit(mesh.face_vectors(surface.vertices, surface.faces))
+    result = np.full(len(points), np.inf)
+    for more in (0.3, 0.6, 1.0, 1.5):
+        left = np.flatnonzero(np.isinf(result))
+        ahead = 0.6 * about[left] + more * spacing
+        beyond = points[left] + ahead[:, None] * normals[left]
+        _, triangle, place = surface.nearest(beyond)
+        other = np.einsum("ij,ij->i", facing[triangle], normals[left]) < -0.3
+        result[left[other]] = np.linalg.norm(place[other] - points[left[other]], axis=1)
+    return result
 
 
 def _far_round(

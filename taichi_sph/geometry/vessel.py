@@ -243,10 +243,9 @@ class Vessel:
         points, nearest = wall_sampling.relaxed_points(self.vertices, faces, spacing, seed)
         figures = wall_sampling.spacing_statistics(points, self.vertices, faces, spacing)
         normals = wall_sampling.normals_at(self.vertices, faces, points, nearest)
-        # A coarser spacing than the proxies' own makes the pairs fewer, where they are dense.
-        gaps = gaps_at(
-            self.vertices, faces, points, nearest, normals, max(spacing, setback), GAP * setback
-        )
+        # Where proxies are denser than blood the pairs are made fewer by the coarser length.
+        length, widest = max(spacing, setback), GAP * setback
+        gaps = gaps_at(self._surface, faces, points, nearest, normals, length, widest)
         positions = points + np.minimum(setback, 0.5 * gaps)[:, None] * normals
         for opening in self.openings:
             if opening.is_open:
