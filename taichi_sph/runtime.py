@@ -78,7 +78,7 @@ def finish_fields() -> None:
 
 
 def _abandon_fork() -> None:
-    """Leave Taichi in memory in a fork: taking it down would wait for threads that are not there."""
+    """Leave Taichi in memory in a fork: its end would wait for threads that are not there."""
     if _started is not None:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))
 

@@ -49,12 +49,10 @@ def test_a_run_ends_where_it_is_told_to() -> None:
     assert RunOptions("box", control=8080, frames=3).end(scene) == 3 * scene.frame_interval
 
 
-def test_a_log_is_never_replaced_and_a_run_goes_on_in_the_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_is_never_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scene = find_scene("box")
-    asked, again = RunOptions("box", control=1), RunOptions("box", control=1, resume=FILE)
+    asked = RunOptions("box", control=1)
     assert RunOptions("box").session_file(scene) is None
     assert RunOptions("box", session=FILE).session_file(scene) == FILE
     for name in ("box.session.jsonl", "box.2.session.jsonl", "box.3.session.jsonl"):
@@ -62,4 +60,3 @@ def test_a_log_is_never_replaced_and_a_run_goes_on_in_the_last(
         Path(name).write_text("")  # of a start that was refused
         assert asked.session_file(scene) == Path(name)
         Path(name).write_text("{}")
-        assert again.session_file(scene) == Path(name)
