@@ -83,7 +83,7 @@ def narrowed(percent: float, spacing: float, height: float) -> Callable[[Path], 
         table = msgspec.json.decode((source / "centreline.json").read_bytes())
         table["narrowing"] = percent
         (folder / "centreline.json").write_bytes(msgspec.json.encode(table))
-        (folder / "scene.toml").write_text((source / "scene.toml").read_text())
+        (folder / "scene.toml").write_bytes((source / "scene.toml").read_bytes())
         remake(folder)
         scene = read_scene(folder / "scene.toml")
         grid = msgspec.structs.replace(scene.discretization, spacing=spacing)
