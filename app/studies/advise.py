@@ -36,6 +36,7 @@ MEASURES = {
 """What an error budget may be of: errors of the chart that a spacing has."""
 OF_BLOOD_AT_REST = ("drained",)
 """Measures that mean something where the blood stays where it is."""
+AT_REST = "\nThe blood stays where it is: nothing is said of its kinetic energy and momentum."
 DEFAULT = ("drained", "energy")
 """What it is of if nobody says."""
 PROBED = ("implicit, 0 rounds", "pcnet, spacing")
@@ -357,8 +358,7 @@ def advise(
     if not known:
         raise InputError(
             f"advise: the blood of {scene.name} stays where it is for {until:g} s, so nothing can "
-            f"be said of {' and '.join(MEASURES[m] for m in measures)}; ask for the drained part, "
-            "or for a longer time"
+            "be said of its motion; ask for the drained part, or for a longer time"
         )
     found = candidates(probes, rows, runs, known)
     slowest = 1.0 / real_time if real_time else math.inf
@@ -371,10 +371,7 @@ def advise(
         found[found.index(chosen)] = replace(chosen, rejected_because=f"died here: {shown.died}")
     text = explain(scene, chosen, shown, found, error, known, slowest)
     if rests:
-        text += (
-            "\nThe blood stays where it is: of its kinetic energy and momentum, which are next to "
-            "nothing, nothing is said."
-        )
+        text += AT_REST
     return Advice(chosen.method, found, text)
 
 
