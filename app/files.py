@@ -137,6 +137,11 @@ def table(title: str, *headings: str, left: Collection[str] = ()) -> Table:
     return found
 
 
+def percent(value: float, digits: int = 1) -> str:
+    """A fraction for people, in per cent; a dash where there is none."""
+    return f"{100.0 * value:.{digits}f} %" if math.isfinite(value) else "-"
+
+
 def console(file: TextIO | None = None) -> Console:
     """A terminal, stdout by default; wide where it is none, so that nothing is cut.
 

@@ -1,13 +1,15 @@
 """Models by name: what `--model` takes, and what is compared."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:
     from taichi_sph.scene import Scene
     from taichi_sph.simulation import ModelFactory
 
-MODELS = ("physics", "implicit", "pcnet")
+Model = Literal["physics", "implicit", "pcnet"]
+"""Name of a model."""
+MODELS: tuple[str, ...] = get_args(Model)
 
 
 def model_factory(

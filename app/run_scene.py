@@ -125,7 +125,9 @@ def facts_of(options: RunOptions, scene: Scene) -> dict[str, Any]:
     }  # fmt: skip
     script = options.script
     if script is not None:
-        facts["script"] = script.read_text(errors="replace") if script.is_file() else ""
+        facts["script"] = (
+            script.read_text(encoding="utf-8", errors="replace") if script.is_file() else ""
+        )
     weights = options.weights or weights_for(scene)
     if options.model == "pcnet" or (options.is_acted_on and weights.is_file()):
         facts["files"]["weights"] = file_hash(weights)

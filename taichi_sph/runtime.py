@@ -16,7 +16,7 @@ import numpy as np
 import taichi as ti
 
 from taichi_sph.errors import InputError, RunError
-from taichi_sph.system import pin, processors
+from taichi_sph.system import after_fork, pin, processors
 from taichi_sph.system import threads as known_threads
 
 ARCHITECTURES = ("cpu", "gpu")
@@ -83,8 +83,7 @@ def _abandon_fork() -> None:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(ti.lang.impl.get_runtime().prog))
 
 
-if hasattr(os, "register_at_fork"):  # where processes can be forked
-    os.register_at_fork(after_in_child=_abandon_fork)
+after_fork(_abandon_fork)
 
 
 def float_dtype() -> type[np.floating]:

@@ -192,6 +192,14 @@ class Scene(_Table):
     text: str = ""
     """The TOML text as read, kept in recordings (set by the reader)."""
 
+    @property
+    def driver(self) -> str:
+        """What drives the blood beside gravity, as "openings.inlet is driven"; empty if nothing."""
+        for name, opening in self.openings.items():
+            if opening.driven:
+                return f"openings.{name} is driven"
+        return "the wall pulses" if self.wall is not None else ""
+
     def __post_init__(self) -> None:
         if math.hypot(*self.gravity) > 1e3:
             raise ValueError(f"gravity: {self.gravity} m/s^2 is not a plausible body force")

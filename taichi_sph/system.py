@@ -5,8 +5,9 @@ Beside each stands what is done where it is missing, so that nothing else needs 
 
 import contextlib
 import os
+import select
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -104,6 +105,27 @@ def pin(thread: int, processor: int) -> None:
     if hasattr(os, "sched_setaffinity"):
         with contextlib.suppress(OSError):
             os.sched_setaffinity(thread, {processor})
+
+
+def named_pipe() -> tuple[int, int, str] | None:
+    """Reading end, writing end and path of a pipe; None where a pipe has no path (Windows)."""
+    if not hasattr(select, "poll") or not os.path.isdir("/dev/fd"):
+        return None
+    source, sink = os.pipe()
+    return source, sink, f"/dev/fd/{sink}"
+
+
+def has_bytes(source: int, patience: int | None) -> bool:
+    """Whether bytes are in a `named_pipe`, or come before so long [ms], or it is closed."""
+    asked = select.poll()
+    asked.register(source, select.POLLIN)
+    return bool(asked.poll(patience))
+
+
+def after_fork(work: Callable[[], None]) -> None:
+    """Have a function called in every fork of this process; nothing where there are none."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=work)
 
 
 def largest_memory() -> float:

@@ -12,7 +12,11 @@ def describe_machine(arch: str, threads: int | None) -> dict[str, Any]:
     model = platform.processor()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        names = [s for s in cpuinfo.read_text().splitlines() if s.startswith("model name")]
+        names = [
+            s
+            for s in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
+            if s.startswith("model name")
+        ]
         model = names[0].partition(":")[2].strip() if names else model
     import taichi
 

@@ -59,6 +59,11 @@ processes = click.option(
     show_default=True,
     help="How many runs at once.",
 )
+scheduler = click.option(
+    "--scheduler",
+    metavar="dask:ADDRESS",
+    help="Scheduler of a Dask cluster that does the work.  [default: this machine does]",
+)
 weights = click.option(
     "--weights",
     type=output_path,

@@ -76,6 +76,7 @@ def compare(
 @options.weights
 @click.option("--only", default="", metavar="TEXT", help="Only methods with this in their name.")
 @click.option("--peer", is_flag=True, help="Chart SPlisHSPlasH's WCSPH and DFSPH too.")
+@options.scheduler
 @options.machine
 def chart(
     scenes: tuple[str, ...],
@@ -87,6 +88,7 @@ def chart(
     weights: tuple[Path, ...],
     only: str,
     peer: bool,
+    scheduler: str | None,
     arch: str,
     threads: int | None,
 ) -> None:
@@ -97,18 +99,19 @@ def chart(
     from app.files import check_output
     from app.locks import claimed
     from app.scenes.library import find_scene, varied
-    from app.studies import chart as charting
+    from app.studies import chart as study
+    from app.studies.chart_report import draw, print_tables
     from app.training.train import check_plot
 
     check_output(out, "--out", b"scene,")
     check_plot(plot)
     found = [varied(find_scene(name), height, spacing) for name in scenes]
-    methods = charting.asked(weights, only, peer)
+    methods = study.select_methods(weights, only, peer)
     with claimed(out, "--out"), claimed(plot, "--plot"):
-        rows = charting.main(found, until, out, methods, arch, threads)
-        charting.print_tables(rows)
+        rows = study.main(found, until, out, methods, arch, threads, scheduler)
+        print_tables(rows)
         if plot is not None:
-            charting.draw(rows, plot)
+            draw(rows, plot)
 
 
 @click.command()
@@ -129,6 +132,7 @@ def chart(
 @click.option("--only", default="", metavar="TEXT", help='Only what has this in "METHOD, CASE".')
 @options.weights
 @options.processes
+@options.scheduler
 @options.arch
 def stability(out: Path, plot: Path | None, **given: Any) -> None:
     """Run every method where methods fail, and say which live.
@@ -206,4 +210,6 @@ def advise(
         console().print(study.candidates_table(found, advice))
         click.echo(advice.text)
         if check is not None:
-            click.echo(study.checked(found, advice, error, measures, end, check, arch, threads))
+            click.echo(
+                study.check_advice(found, advice, error, measures, end, check, arch, threads)
+            )

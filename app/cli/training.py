@@ -49,15 +49,17 @@ class Heights(click.ParamType):
 )
 @click.option("--features", is_flag=True, help="Store the features and targets too.")
 @options.processes
-@click.option("--scheduler", metavar="dask:ADDRESS", help="Record on a Dask cluster.")
+@options.scheduler
 @options.machine
 @options.seed
-def record(scene: str, **given: Any) -> None:
+def record(scene: str, out: Path, **given: Any) -> None:
     """Record the physics for training: a run for each column height, resumed if cut short."""
+    from app.locks import claimed
     from app.scenes.library import scene_path
     from app.training.record import record as record_runs
 
-    click.echo(str(record_runs(scene_path(scene), **given)))
+    with claimed(out, "--out"):
+        click.echo(str(record_runs(scene_path(scene), out=out, **given)))
 
 
 @click.command()
@@ -152,6 +154,7 @@ def train(
     "--ablate", is_flag=True, help="Leave out groups of features in turn, instead of the rungs."
 )
 @options.processes
+@options.scheduler
 @options.plot("the ladder")
 @options.arch
 def ladder(data: tuple[Path, ...], out: Path, plot: Path | None, **given: Any) -> None:

@@ -74,6 +74,10 @@ class JobProgress:
             text += f", {duration(seconds / done * (self._count - done))} left"
         return text
 
+    def so_far(self) -> str:
+        """Where things stand, by the jobs that have ended."""
+        return self.state(self._finished, time.perf_counter())
+
     def show(self, done: float) -> None:
         """Show that so many jobs are done, counting parts of those under way."""
         now = time.perf_counter()

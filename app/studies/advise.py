@@ -18,12 +18,11 @@ from rich.table import Table
 
 from app.files import read_rows, table
 from app.jobs.process import in_own_process
-from app.studies.chart import Job, Row, check_end, main, pour
-from app.studies.methods import METHODS, Method
-from app.studies.stability import CASES
-from app.studies.stability import METHODS as TESTED
-from app.studies.stability import Row as Trial
-from app.studies.timed_run import RULES, Trace, errors_of
+from app.studies.cases import CASES
+from app.studies.chart import Job, Row, check_end, main, run_timed
+from app.studies.methods import CHARTED, METHODS, TESTED, Method
+from app.studies.stability import Row as StabilityRow
+from app.studies.timed_run import RULES, Trace, errors_of, is_at_rest, require_falling
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.scene import NewtonianTable, Scene
 
@@ -35,6 +34,9 @@ MEASURES = {
     "field": "the momentum on a coarse grid",
 }
 """What an error budget may be of: errors of the chart that a spacing has."""
+OF_BLOOD_AT_REST = ("drained",)
+"""Measures that mean something where the blood stays where it is."""
+AT_REST = "\nThe blood stays where it is: nothing is said of its kinetic energy and momentum."
 DEFAULT = ("drained", "energy")
 """What it is of if nobody says."""
 PROBED = ("implicit, 0 rounds", "pcnet, spacing")
@@ -70,8 +72,8 @@ class Candidate:
     """Largest of those asked for, against a pour at half the spacing."""
     wall_per_simulated: float
     """Wall seconds for a simulated second."""
-    unfit: str = ""
-    """Why it is not advised, if so."""
+    rejected_because: str = ""
+    """Why it is not advised, if it is not."""
 
 
 @dataclass(frozen=True)
@@ -86,17 +88,17 @@ class Advice:
 
 def probe(job: Job) -> Probe:
     """Pour a scene; needs a process of its own."""
-    poured, _ = pour(job, RULES)
-    derived, spacing = poured.simulation.derived, poured.simulation.scene.discretization.spacing
+    run, _ = run_timed(job, RULES)
+    derived, spacing = run.simulation.derived, run.simulation.scene.discretization.spacing
     return Probe(
         method=job.method,
         spacing=spacing,
         blood_particles=derived.blood_particles,
         until=job.until,
-        died=poured.death,
-        narrowest=poured.simulation.vessel.narrowest,
-        wall_per_simulated=poured.wall_per_simulated,
-        trace=poured.trace,
+        died=run.failure,
+        narrowest=run.simulation.vessel.narrowest,
+        wall_per_simulated=run.wall_per_simulated,
+        trace=run.trace,
     )
 
 
@@ -112,12 +114,14 @@ def expected(apart: dict[float, float]) -> dict[float, float]:
     return {s: math.hypot(e, 0.5 * rise) for s, e in ({1.0: 0.0} | apart).items()}
 
 
-def ratio(rows: Sequence[Row], kin: Sequence[Method], base: dict[float, str], value: str) -> float:
+def ratio(
+    rows: Sequence[Row], variants: Sequence[Method], base: dict[float, str], value: str
+) -> float:
     """What methods are to those of a base at the same spacing: a geometric mean over the chart.
 
     Args:
         rows: the chart.
-        kin: the methods.
+        variants: the methods.
         base: names of the others by relative spacing.
         value: which figure of a row.
 
@@ -128,43 +132,38 @@ def ratio(rows: Sequence[Row], kin: Sequence[Method], base: dict[float, str], va
     found = [
         figures[scene, method.name] / figures[scene, base[method.spacing]]
         for scene in dict.fromkeys(row.scene for row in rows)
-        for method in kin
+        for method in variants
         if figures.get((scene, method.name), 0.0) > 0.0
         and figures.get((scene, base.get(method.spacing, "")), 0.0) > 0.0
     ]
     return statistics.geometric_mean(found) if found else math.nan
 
 
-def setting(method: Method) -> Method:
-    """A method but for its name and its spacing."""
-    return replace(method, name="", curve="", spacing=1.0)
-
-
-def listed() -> list[Method]:
+def advisable() -> list[Method]:
     """Methods that may be advised: charted, with a step of their own, and tested for stability."""
-    tested = {setting(method) for method in TESTED}
-    return [method for method in METHODS if setting(method) in tested]
+    tested = {method.setting for method in TESTED}
+    return [method for method in CHARTED if method.setting in tested]
 
 
-def lived(trials: Sequence[Trial], method: Method) -> tuple[int, int]:
+def survival(runs: Sequence[StabilityRow], method: Method) -> tuple[int, int]:
     """Starts that a method lived through, of those that the textbook's physics lives through.
 
     Cases at another step than a method's own are left out: `run` never takes one.
     """
-    name = next(tested.name for tested in TESTED if setting(tested) == setting(method))
+    name = next(tested.name for tested in TESTED if tested.setting == method.setting)
     own = {case.name for case in CASES if case.step == 1.0}
     bearable = {
         (row.case, row.start)
-        for row in trials
+        for row in runs
         if row.method == "physics" and not row.died and row.case in own
     }
-    mine = [r for r in trials if r.method == name and (r.case, r.start) in bearable]
+    mine = [r for r in runs if r.method == name and (r.case, r.start) in bearable]
     return sum(not row.died for row in mine), len(mine)
 
 
-def unsafe(method: Method, trials: Sequence[Trial]) -> str:
+def unsafe(method: Method, runs: Sequence[StabilityRow]) -> str:
     """What the stability cases say against a method; empty if nothing."""
-    good, starts = lived(trials, method)
+    good, starts = survival(runs, method)
     if good < SAFE * starts or not starts:
         return f"lived through {good} of {starts} starts that the physics lives through"
     return ""
@@ -192,42 +191,47 @@ def errors_here(
 
 
 def candidates(
-    probes: Sequence[Probe], rows: Sequence[Row], trials: Sequence[Trial], measures: Sequence[str]
+    probes: Sequence[Probe],
+    rows: Sequence[Row],
+    runs: Sequence[StabilityRow],
+    measures: Sequence[str],
 ) -> list[Candidate]:
     """All listed methods at the spacings poured, cheapest first."""
     poured = {p.method.name: p for p in probes}
     errors = errors_here(probes, rows, measures)
     base = {m.spacing: m.name for m in METHODS if m.curve == PROBED[0]}
     result = []
-    for method in listed():
+    for method in advisable():
         own, like = poured.get(method.name), poured.get(base[method.spacing])
         if own is not None:
             mine, cost = errors.get(method.name, {}), own.wall_per_simulated
         elif like is not None and not like.died:
-            kin = [m for m in METHODS if setting(m) == setting(method)]
-            shares = {m: ratio(rows, kin, base, m) for m in measures}
+            variants = [m for m in CHARTED if m.setting == method.setting]
+            shares = {m: ratio(rows, variants, base, m) for m in measures}
             mine = {
                 m: e if math.isnan(shares[m]) else e * shares[m]
                 for m, e in errors.get(like.method.name, {}).items()
             }
-            cost = ratio(rows, [method], base, "at_rest") * like.wall_per_simulated
+            cost = ratio(rows, [method], base, "normalised_cost") * like.wall_per_simulated
         else:
             continue
         error = max(mine.values(), default=math.nan)
-        result.append(Candidate(method, error, cost, reason(method, own, rows, trials)))
-        if math.isnan(error + cost) and not result[-1].unfit:
-            result[-1] = replace(result[-1], unfit="not on the chart")
+        result.append(Candidate(method, error, cost, reason(method, own, rows, runs)))
+        if math.isnan(error + cost) and not result[-1].rejected_because:
+            result[-1] = replace(result[-1], rejected_because="not on the chart")
     return sorted(result, key=lambda c: (math.isnan(c.wall_per_simulated), c.wall_per_simulated))
 
 
-def reason(method: Method, own: Probe | None, rows: Sequence[Row], trials: Sequence[Trial]) -> str:
+def reason(
+    method: Method, own: Probe | None, rows: Sequence[Row], runs: Sequence[StabilityRow]
+) -> str:
     """Why a method is not fit; empty if it is.  `own` is its pour of the scene, if there is one."""
     if own is not None and own.died:
         return f"died here: {own.died}"
     died = [row for row in rows if row.method == method.name and row.died]
     if own is None and died:
         return f"died on the chart ({died[0].scene}: {died[0].died})"
-    return unsafe(method, trials)
+    return unsafe(method, runs)
 
 
 def choose(found: Sequence[Candidate], error: float, slowest: float) -> Candidate:
@@ -238,7 +242,7 @@ def choose(found: Sequence[Candidate], error: float, slowest: float) -> Candidat
     Raises:
         RunError: none is fit.
     """
-    fit = [c for c in found if not c.unfit]
+    fit = [c for c in found if not c.rejected_because]
     if not fit:
         raise RunError("advise: no listed method is fit for this scene")
     quick = [c for c in fit if c.wall_per_simulated <= slowest]
@@ -297,8 +301,12 @@ def explain(
         f"({1.0 / shown.wall_per_simulated:.2g} x real time).",
     ]
     for c in found:
-        if c.unfit and c.error <= error and c.wall_per_simulated < chosen.wall_per_simulated:
-            lines.append(f"Cheaper, but not advised: {c.method.name} ({c.unfit}).")
+        if (
+            c.rejected_because
+            and c.error <= error
+            and c.wall_per_simulated < chosen.wall_per_simulated
+        ):
+            lines.append(f"Cheaper, but not advised: {c.method.name} ({c.rejected_because}).")
             break
     wanted = d * (0.5 + error / chosen.error * (chosen.method.spacing - 0.5)) if chosen.error else d
     if chosen.error > error and wanted > 0.55 * d:
@@ -326,34 +334,44 @@ def advise(
         InputError: the scene cannot be poured, or the time is too short.
         RunError: nothing lives.
     """
+    require_falling(scene, "advise")
     check_end(scene, until)
 
     def look(method: Method) -> Probe:
-        shown = in_own_process(probe, Job(scene, method, until, Path(), arch, threads))
+        shown = in_own_process(probe, Job(scene, method, until, None, arch, threads))
         state = shown.died or f"{shown.wall_per_simulated:.3g} s a simulated s"
         print(f"{scene.name}, {method.name}: {state}", file=sys.stderr)
         return shown
 
     rows = read_rows(EVIDENCE / "chart.csv", Row)
-    trials = read_rows(EVIDENCE / "stability.csv", Trial)
+    runs = read_rows(EVIDENCE / "stability.csv", StabilityRow)
     probes: list[Probe] = []
-    plain = [m for m in METHODS if m.curve in PROBED and not unsafe(m, trials)]
+    plain = [m for m in METHODS if m.curve in PROBED and not unsafe(m, runs)]
     for method in sorted(plain, key=lambda m: -m.spacing):  # cheap first
         try:
             probes.append(look(method))
         except InputError:  # too coarse for the vessel, say
             if method.spacing == 1.0:
                 raise
-    found = candidates(probes, rows, trials, measures)
+    rests = any(is_at_rest(p.trace) for p in probes if p.method.spacing == 1.0 and not p.died)
+    known = [m for m in measures if not rests or m in OF_BLOOD_AT_REST]
+    if not known:
+        raise InputError(
+            f"advise: the blood of {scene.name} stays where it is for {until:g} s, so nothing can "
+            "be said of its motion; ask for the drained part, or for a longer time"
+        )
+    found = candidates(probes, rows, runs, known)
     slowest = 1.0 / real_time if real_time else math.inf
     while True:
         chosen = choose(found, error, slowest)
-        known = [p for p in probes if p.method == chosen.method]
-        shown = known[0] if known else look(chosen.method)
+        seen = [p for p in probes if p.method == chosen.method]
+        shown = seen[0] if seen else look(chosen.method)
         if not shown.died:
             break
-        found[found.index(chosen)] = replace(chosen, unfit=f"died here: {shown.died}")
-    text = explain(scene, chosen, shown, found, error, measures, slowest)
+        found[found.index(chosen)] = replace(chosen, rejected_because=f"died here: {shown.died}")
+    text = explain(scene, chosen, shown, found, error, known, slowest)
+    if rests:
+        text += AT_REST
     return Advice(chosen.method, found, text)
 
 
@@ -367,15 +385,26 @@ def candidates_table(scene: Scene, advice: Advice) -> Table:
         shown.add_row(
             c.method.name,
             f"{1e3 * c.method.spacing * scene.discretization.spacing:.3g}",
-            f"{c.wall_per_simulated:.3g}",
-            f"{1.0 / c.wall_per_simulated:.2g}",
-            f"{100 * c.error:.2g}",
-            "advised" if c.method == advice.method else c.unfit,
+            _known(c.wall_per_simulated, ".3g"),
+            _known(1.0 / c.wall_per_simulated, ".2g"),
+            _known(100.0 * c.error, ".2g"),
+            "advised" if c.method == advice.method else c.rejected_because,
         )
     return shown
 
 
-def checked(
+def _largest_error(row: Row, measures: Sequence[str]) -> float:
+    """The largest of the errors asked for that there are."""
+    errors = [getattr(row, measure) for measure in measures]
+    return max((e for e in errors if math.isfinite(e)), default=0.0)
+
+
+def _known(value: float, form: str) -> str:
+    """A figure for people; a dash where there is none."""
+    return format(value, form) if math.isfinite(value) else "-"
+
+
+def check_advice(
     scene: Scene,
     advice: Advice,
     error: float,
@@ -393,26 +422,28 @@ def checked(
     """
     methods = [candidate.method for candidate in advice.candidates]
     rows = main([scene], until, out, methods, arch, threads)
-    names = {candidate.method.name for candidate in advice.candidates if not candidate.unfit}
+    names = {
+        candidate.method.name for candidate in advice.candidates if not candidate.rejected_because
+    }
     mine = [row for row in rows if (row.scene, row.until) == (scene.name, until)]
-    found = {row.method: max(getattr(row, m) for m in measures) for row in mine if not row.died}
+    found = {row.method: _largest_error(row, measures) for row in mine if not row.died}
     row = next(row for row in mine if row.method == advice.method.name)
     if row.died:
         return f"Checked: {row.method} died: {row.died}."
     within = "within" if found[row.method] <= error else "beyond"
     better = [
         other
-        for other in sorted(mine, key=lambda other: other.at_rest)
+        for other in sorted(mine, key=lambda other: other.normalised_cost)
         if other.method in names & set(found)
-        and other.at_rest < row.at_rest
+        and other.normalised_cost < row.normalised_cost
         and found[other.method] <= error
     ]
     text = f"Checked: {row.method} is off by {100 * found[row.method]:.2g} %, {within} the budget; "
     if not better:
         return text + "no cheaper one that is fit is within it."
     costs = ", ".join(
-        f"{other.method} ({100 * found[other.method]:.2g} %, {row.at_rest / other.at_rest:.2g} "
-        "times cheaper)"
+        f"{other.method} ({100 * found[other.method]:.2g} %, "
+        f"{row.normalised_cost / other.normalised_cost:.2g} times cheaper)"
         for other in better
     )
     return text + f"cheaper and within it: {costs}."

@@ -4,6 +4,7 @@ All are stepped in turn, frame by frame, in one process: what else the machine d
 The first frame of each, which compiles, is not timed.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,10 +13,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from app.files import console, write_json
+from app.files import console, percent, table, write_json
 from app.models import model_factory
 from app.progress import Progress
-from app.studies.timed_run import TimedRun, Trace, errors_of
+from app.studies.timed_run import TimedRun, Trace, errors_of, require_falling
 from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.scene import Scene
@@ -24,7 +25,7 @@ from taichi_sph.simulation import Simulation
 
 @dataclass(frozen=True)
 class Result:
-    """How a contestant did; errors are against the first one."""
+    """How a model did; errors are against the first one."""
 
     name: str
     died: str
@@ -42,7 +43,8 @@ class Result:
     compression_p99: float
     """Largest of all frames."""
     path_error: float
-    """Largest distance of the centres of mass over the length of the first one's path."""
+    """Largest distance of the centres of mass over the length of the first one's path; NaN where
+    the blood stays where it is."""
     drained_error: float
     """Largest difference of the drained part."""
     half_drained: float
@@ -58,7 +60,7 @@ def result_of(one: TimedRun, first: TimedRun) -> Result:
     simulation = one.simulation
     return Result(
         name=one.name,
-        died=one.death,
+        died=one.failure,
         steps=simulation.steps,
         milliseconds_per_step=one.milliseconds_per_step,
         wall_per_simulated=one.wall_per_simulated,
@@ -76,7 +78,7 @@ def result_of(one: TimedRun, first: TimedRun) -> Result:
     )
 
 
-def contestants(
+def make_runs(
     scene: Scene, vessel: Vessel, weights: list[Path], soft: list[float], seed: int
 ) -> list[TimedRun]:
     """The physics, the implicit model, networks, and the physics at lower sound speeds.
@@ -85,19 +87,20 @@ def contestants(
         InputError: weights that do not fit.
     """
 
-    def stand(name: str, of: Scene, make: Callable[..., Any] = SphAcceleration) -> TimedRun:
+    def add(name: str, of: Scene, make: Callable[..., Any] = SphAcceleration) -> TimedRun:
         simulation = Simulation.from_scene(of, make, seed, vessel)
-        return TimedRun(name, simulation, Trace(scene.frame_interval))
+        trace = Trace(scene.frame_interval, scene.discretization.spacing)
+        return TimedRun(name, simulation, trace)
 
-    runs = [stand(name, scene, model_factory(name, scene)) for name in ("physics", "implicit")]
+    runs = [add(name, scene, model_factory(name, scene)) for name in ("physics", "implicit")]
     for path in weights:
         file = path.with_suffix("").as_posix()
         name = "pcnet" if len(weights) == 1 else f"pcnet, {'/'.join(file.split('/')[-2:])}"
-        runs.append(stand(name, scene, model_factory("pcnet", scene, path)))
+        runs.append(add(name, scene, model_factory("pcnet", scene, path)))
     for ratio in soft:
         grid = msgspec.structs.replace(scene.discretization, sound_speed_ratio=ratio)
         softer = msgspec.structs.replace(scene, discretization=grid)
-        runs.append(stand(f"physics, c = {ratio:g} U", softer))
+        runs.append(add(f"physics, c = {ratio:g} U", softer))
     return runs
 
 
@@ -113,9 +116,10 @@ def compare(
     """Pour a scene by every model to a time [s], or until all vessels are empty.
 
     Raises:
-        InputError: weights that do not fit, or a column that does not.
+        InputError: weights that do not fit, a column that does not, or a scene that is driven.
     """
-    runs = contestants(scene, read_vessel(scene), weights, soft, seed)
+    require_falling(scene, "compare")
+    runs = make_runs(scene, read_vessel(scene), weights, soft, seed)
     interval = scene.frame_interval
     frames = max(1, round(until / interval))
     progress = Progress(frames * interval, scene.name)
@@ -124,7 +128,7 @@ def compare(
             for run in runs:
                 run.frame(frame * interval)
             progress.show(frame * interval, sum(run.simulation.steps for run in runs), 0)
-            if all(run.death or run.empty for run in runs):
+            if all(run.failure or run.empty for run in runs):
                 break
     finally:
         progress.close()
@@ -155,12 +159,8 @@ def as_json(scene: Scene, runs: list[TimedRun], results: list[Result]) -> dict[s
 
 def print_results(scene: Scene, results: list[Result]) -> None:
     """A table for people."""
-    from rich.table import Table
-
-    table = Table(title=f"{scene.name}: against the physics")
-    table.add_column("")
-    for result in results:
-        table.add_column(result.name, justify="right")
+    names = [result.name for result in results]
+    shown = table(f"{scene.name}: against the physics", "", *names)
     rows: list[tuple[str, Callable[[Result], str]]] = [
         ("ended early", lambda r: "yes" if r.died else "no"),
         ("steps", lambda r: str(r.steps)),
@@ -171,14 +171,17 @@ def print_results(scene: Scene, results: list[Result]) -> None:
         ("wall corrections", lambda r: str(r.wall_corrections)),
         ("taken over by the physics", lambda r: f"{100 * r.fallback_share:.1f} %"),
         ("compression, 99th percentile", lambda r: f"{100 * r.compression_p99:.1f} %"),
-        ("centre of mass, of its path", lambda r: f"{100 * r.path_error:.1f} %"),
+        ("centre of mass, of its path", lambda r: percent(r.path_error)),
         ("drained part, largest error", lambda r: f"{100 * r.drained_error:.1f} %"),
-        ("half drained after [s]", lambda r: f"{r.half_drained:.4f}"),
+        (
+            "half drained after [s]",
+            lambda r: f"{r.half_drained:.4f}" if math.isfinite(r.half_drained) else "never",
+        ),
         ("peak kinetic energy [mJ]", lambda r: f"{1e3 * r.energy_peak:.4g}"),
     ]
     for label, text in rows:
-        table.add_row(label, *(text(result) for result in results))
-    console().print(table)
+        shown.add_row(label, *(text(result) for result in results))
+    console().print(shown)
     for result in results:
         if result.died:
             print(f"{result.name}: {result.died}")
@@ -199,7 +202,7 @@ def draw(scene: Scene, runs: list[TimedRun], path: Path) -> None:
             color=line.get_color(),
             label=run.name,
         )
-        if run.death and run.trace.drained:
+        if run.failure and run.trace.drained:
             left.plot(times[-1], 100.0 * run.trace.drained[-1], "x", color=line.get_color(), ms=9)
     left.set(xlabel="time [s]", ylabel="blood that has left [%]", title=scene.title)
     right.set(xlabel="time [s]", ylabel="compression, 99th percentile [%]", yscale="log")

@@ -1,4 +1,4 @@
-"""Methods that are charted and tested: an entry each.
+"""Methods that are compared: an entry each, for the chart, the stability cases and advice.
 
 A method is a model at a setting.  Methods of one `curve` are joined by a line on the chart.
 """
@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import taichi as ti
 
-from app.models import model_factory
+from app.models import MODELS, model_factory
 from app.studies.splishsplash import SOLVERS, Peer
 from nn.weights import Weights
 from taichi_sph.fluid.implicit import implicit_factory
@@ -21,15 +21,36 @@ from taichi_sph.particles.wall import Wall
 from taichi_sph.scene import NewtonianTable, Scene
 from taichi_sph.simulation import ModelFactory, Simulation
 
+CURVES = {
+    "physics, spacing": "tab:blue",
+    "physics, sound speed": "tab:cyan",
+    "physics, longest step": "navy",
+    "physics, Newtonian": "tab:purple",
+    "soft physics, spacing": "magenta",
+    "implicit, spacing": "tab:green",
+    "implicit, 0 rounds": "teal",
+    "implicit, rounds": "olive",
+    "ballistic": "black",
+    "pcnet, spacing": "tab:red",
+    "splishsplash-wcsph, spacing": "gold",
+    "splishsplash-wcsph, longest step": "darkgoldenrod",
+    "splishsplash-dfsph, spacing": "tab:orange",
+    "splishsplash-dfsph, longest step": "tab:brown",
+}
+"""Curves of the chart, with the colour of each."""
+OTHER_NETWORKS = ("tab:pink", "tab:gray", "lime")
+"""Colours of networks that are given as files, in turn."""
+
 
 @dataclass(frozen=True)
 class Method:
     """A model at a setting; what is None is as the scene has it."""
 
     name: str
-    curve: str
+    curve: str = ""
+    """One of CURVES; empty of what is on none."""
     model: str = "physics"
-    """One of app.models, "ballistic", or one of app.peers."""
+    """One of app.models, "ballistic", or one of app.studies.splishsplash."""
     spacing: float = 1.0
     """Times the scene's."""
     sound_speed_ratio: float | None = None
@@ -45,6 +66,21 @@ class Method:
     """Of the network."""
     guarded: bool = True
     """Whether the physics stands in for a direct head that runs away."""
+    is_charted: bool = True
+    """Whether the chart has it."""
+    is_tested: bool = False
+    """Whether it meets the stability cases."""
+
+    def __post_init__(self) -> None:
+        if self.model not in (*MODELS, "ballistic", *SOLVERS):
+            raise ValueError(f"{self.name}: there is no model {self.model}")
+        if self.curve and self.curve not in CURVES and self.weights is None:
+            raise ValueError(f"{self.name}: there is no curve {self.curve}; there are {[*CURVES]}")
+
+    @property
+    def setting(self) -> "Method":
+        """What it is but for its name, its spacing and where it is shown."""
+        return replace(self, name="", curve="", spacing=1.0, is_charted=True, is_tested=False)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene as this method pours it; the column keeps its volume."""
@@ -161,17 +197,20 @@ def fall(p: ti.template(), gravity: ti.math.vec3, rest_density: float):
         p.density[i] = rest_density
 
 
-REFERENCE = Method("reference", "", spacing=0.5, sound_speed_ratio=20.0)
+REFERENCE = Method("reference", spacing=0.5, sound_speed_ratio=20.0)
 """Half the spacing and stiff: errors are against it."""
-FLOOR = Method("spacing 2/3, c = 20 U", "", spacing=2.0 / 3.0, sound_speed_ratio=20.0)
+DISCRETISATION_FLOOR = Method("spacing 2/3, c = 20 U", spacing=2.0 / 3.0, sound_speed_ratio=20.0)
 """How far the next coarser one is from the reference: no error below means anything."""
 
 COARSER = (1.25, 1.5, 2.0)
+"""Spacings at which methods are charted too, times the scene's."""
 
 
 def _over_spacing(plain: Method) -> list[Method]:
     """A method and its coarser likes."""
-    coarser = [replace(plain, name=f"{plain.name}, {s:g} d", spacing=s) for s in COARSER]
+    coarser = [
+        replace(plain, name=f"{plain.name}, {s:g} d", spacing=s, is_tested=False) for s in COARSER
+    ]
     return [plain, *coarser]
 
 
@@ -181,13 +220,20 @@ SOFT = Method(
     sound_speed_ratio=3.0,
     artificial_viscosity=0.3,
     courant_number=0.8,
+    is_tested=True,
 )
 """The physics at its fastest, with room left: steps half as long again live too."""
 
 METHODS: tuple[Method, ...] = (
-    *_over_spacing(Method("physics", "physics, spacing")),
+    *_over_spacing(Method("physics", "physics, spacing", is_tested=True)),
+    Method("physics, 2 x step", step_factor=2.0, is_charted=False, is_tested=True),
     *(
-        Method(f"physics, c = {c} U", "physics, sound speed", sound_speed_ratio=c)
+        Method(
+            f"physics, c = {c:g} U",
+            "physics, sound speed",
+            sound_speed_ratio=c,
+            is_tested=c == 3.0,
+        )
         for c in (5.0, 3.0, 2.0)
     ),
     *(
@@ -202,12 +248,18 @@ METHODS: tuple[Method, ...] = (
     ),
     Method("physics, Newtonian", "physics, Newtonian", newtonian=True),
     *_over_spacing(SOFT),
-    *_over_spacing(Method("implicit", "implicit, spacing", "implicit")),
-    *_over_spacing(Method("implicit, 0 rounds", "implicit, 0 rounds", "implicit", rounds=0)),
+    Method("physics, printed integrator", integrator="paper", is_charted=False, is_tested=True),
+    *_over_spacing(Method("implicit", "implicit, spacing", "implicit", is_tested=True)),
+    *_over_spacing(
+        Method("implicit, 0 rounds", "implicit, 0 rounds", "implicit", rounds=0, is_tested=True)
+    ),
     *(Method(f"implicit, {k} rounds", "implicit, rounds", "implicit", rounds=k) for k in (2, 4)),
     Method("ballistic", "ballistic", "ballistic"),
-    *_over_spacing(Method("pcnet", "pcnet, spacing", "pcnet")),
+    *_over_spacing(Method("pcnet", "pcnet, spacing", "pcnet", is_tested=True)),
 )
+"""All of them, in the order of tables and matrices."""
+CHARTED = tuple(method for method in METHODS if method.is_charted)
+TESTED = tuple(method for method in METHODS if method.is_tested)
 
 PEERS: tuple[Method, ...] = tuple(
     method
@@ -220,7 +272,7 @@ PEERS: tuple[Method, ...] = tuple(
 """Other programs on the same blood."""
 
 
-def of_weights(path: Path) -> Method:
+def method_of_weights(path: Path) -> Method:
     """The network of a weights file, named by how it was trained.
 
     Raises:

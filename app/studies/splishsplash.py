@@ -91,7 +91,7 @@ def begin(scene: dict[str, Any], folder: Path) -> Any:
             raise RunError(f"--peer: pysplishsplash needs lib{library} ({error})") from None
     import pysplishsplash
 
-    (folder / "peer.json").write_text(json.dumps(scene))
+    (folder / "peer.json").write_text(json.dumps(scene), encoding="utf-8")
     base = pysplishsplash.Exec.SimulatorBase()
     with quiet():
         base.init(useGui=False, sceneFile=str(folder / "peer.json"), outputDir=str(folder / "out"))

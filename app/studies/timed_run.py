@@ -1,7 +1,8 @@
-"""What is measured of a pour, what is compared, and when a run counts as dead.
+"""What is measured of a run, what is compared, and when a run has failed.
 
-The rules were fixed before the first chart and the first stability run.  A run that breaks one is
-dead from that frame on and is shown as such; none is left out.
+The rules were fixed before the first chart and the first stability run.  A run that breaks one has
+failed from that frame on and is shown as such; none is left out.  They are of blood that falls and
+leaves: gravity gives all its energy, and none comes in.
 """
 
 import math
@@ -13,13 +14,14 @@ from scipy.spatial import cKDTree
 
 from app.studies.splishsplash import Peer
 from taichi_sph.diagnostics import FEW, Diagnostics
-from taichi_sph.errors import RunError
+from taichi_sph.errors import InputError, RunError
+from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 
 
 @dataclass(frozen=True)
 class Rules:
-    """When a run is dead, checked at every frame."""
+    """When a run has failed, checked at every frame."""
 
     leaked: float = 1e-3
     """Part of the blood outside the lumen."""
@@ -133,12 +135,27 @@ class Grid:
         return total
 
 
+def require_falling(scene: Scene, command: str) -> None:
+    """Refuse a scene whose blood does more than fall and leave: no rule here would hold.
+
+    Raises:
+        InputError: a pump, a reservoir or the wall drives its blood.
+    """
+    if scene.driver:
+        raise InputError(
+            f"{command} {scene.name}: {scene.driver}; runs are judged by what blood does that only "
+            "falls and leaves: take flow, pressure and pulse out of the scene"
+        )
+
+
 @dataclass
 class Trace:
-    """A pour as it is measured, frame by frame; each frame's values are per blood at the start."""
+    """A run as it is measured, frame by frame; each frame's values are per blood at the start."""
 
     frame_interval: float
     """[s]"""
+    spacing: float = 0.0
+    """Between particles [m]; 0 where it was not kept."""
     drained: list[float] = field(default_factory=list)
     """Part that has left."""
     centre: list[np.ndarray] = field(default_factory=list)
@@ -170,9 +187,22 @@ class Trace:
             self.momentum.append(grid.share_out(x, v / blood).astype(np.float32))
 
 
+def is_at_rest(trace: Trace) -> bool:
+    """Whether the blood of a run stays where it is: its centre moves by less than a spacing.
+
+    Then its path, its momentum and its kinetic energy are next to nothing, and so is the meaning of
+    an error relative to them.
+    """
+    centre = np.array(trace.centre).reshape(-1, 3)
+    centre = centre[np.isfinite(centre).all(axis=1)]
+    if len(centre) == 0 or max(trace.drained, default=0.0) > FEW:
+        return False
+    return bool(np.linalg.norm(centre - centre[0], axis=1).max() < trace.spacing)
+
+
 @dataclass(frozen=True)
 class Errors:
-    """How far a pour is from a reference."""
+    """How far a run is from a reference; NaN what is relative to blood at rest."""
 
     path: float
     """Largest distance of the centres of mass over the length of the reference's path."""
@@ -202,13 +232,18 @@ def errors_of(trace: Trace, reference: Trace) -> Errors:
         for a, b, both in zip(trace.momentum, reference.momentum, together, strict=False)
         if both and np.abs(b).sum() > 0.0
     ]
+    rests = is_at_rest(reference)
     times = trace.frame_interval * np.arange(1, frames + 1)
     half = frames > 0 and drained[-1] > 0.5
     return Errors(
-        path=float(distance / length) if length else 0.0,
+        path=math.nan if rests else float(distance / length) if length else 0.0,
         drained=float(np.abs(drained - wanted).max(initial=0.0)),
-        energy=float(energy.max(initial=0.0) / max(max(reference.energy, default=0.0), 1e-30)),
-        field=float(np.mean(cells)) if cells else math.nan,
+        energy=(
+            math.nan
+            if rests
+            else float(energy.max(initial=0.0) / max(max(reference.energy, default=0.0), 1e-30))
+        ),
+        field=float(np.mean(cells)) if cells and not rests else math.nan,
         compression=max(trace.compression, default=0.0),
         half_drained=float(np.interp(0.5, drained, times)) if half else math.nan,
     )
@@ -216,20 +251,20 @@ def errors_of(trace: Trace, reference: Trace) -> Errors:
 
 @dataclass
 class TimedRun:
-    """A simulation that is poured frame by frame, timed and judged; what has died stays so."""
+    """A simulation that runs frame by frame, timed and judged; what has failed stays so."""
 
     name: str
     simulation: Simulation | Peer
     trace: Trace
     grid: Grid | None = None
     rules: Rules | None = None
-    """None: only what diverges is dead."""
+    """None: only what diverges has failed."""
     seconds: list[float] = field(default_factory=list)
     """Wall time of each frame [s]."""
     compiled: int = 0
     """Steps of the first frame, which compiles and is not timed."""
     most_leaks: int = 0
-    death: str = ""
+    failure: str = ""
     """Why it ended early."""
 
     def __post_init__(self) -> None:
@@ -241,19 +276,19 @@ class TimedRun:
 
     def frame(self, until: float) -> None:
         """Advance to a time [s] and note how the blood stands."""
-        if self.death:
+        if self.failure:
             return
         before = time.perf_counter()
         try:
             self.simulation.advance_to(until)
         except RunError as error:
-            self.death = str(error)
+            self.failure = str(error)
             return
         self.seconds.append(time.perf_counter() - before)
         self.compiled = self.compiled or self.simulation.steps
         figures = self.simulation.diagnostics()
         if self.rules:
-            self.death = broken_rule(
+            self.failure = broken_rule(
                 self.simulation, figures, self._blood, self._speed, self._energy, self.rules
             )
         self.most_leaks = max(self.most_leaks, figures.leaks)

@@ -1,23 +1,23 @@
-"""`vesselflow ladder`: from the paper's network to the default one, each rung measured alike.
+"""`vesselflow ladder`: from the paper's network to the default one, each variant measured alike.
 
-A rung is an entry of RUNGS.  Each is trained on each dataset with several seeds; run 0 chooses the
-weights, the last run, which nothing has looked at, gives the figures.
+A variant is an entry of VARIANTS.  Each is trained on each dataset with several seeds; run 0
+chooses the weights, the last run, which nothing has looked at, gives the figures.
 """
 
 import json
-import multiprocessing
 import statistics
-import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import numpy as np
 
 from app.files import console, table, write_json
+from app.jobs.process import report
+from app.jobs.study import run_study
 from nn.dataset.reader import Dataset
 from nn.features import COUNT, NAMES
 from nn.training.train import Settings, TrainingRuns, train_weights, use_threads
@@ -28,7 +28,7 @@ Fit = Callable[[TrainingRuns, Settings], Weights]
 
 
 @dataclass(frozen=True)
-class Rung:
+class Variant:
     """One kind of network."""
 
     name: str
@@ -69,18 +69,18 @@ def ridge(course: TrainingRuns, settings: Settings) -> Weights:
 
 
 DIRECT = Settings(head="direct")
-RUNGS = (
-    Rung("previous acceleration", replace(DIRECT, correction="none"), persistence),
-    Rung("ridge, 23 features", replace(DIRECT, correction="none"), ridge),
-    Rung("direct, bp", replace(DIRECT, correction="bp")),
-    Rung("direct, periodic", replace(DIRECT, correction="periodic")),
-    Rung("direct, relabel", replace(DIRECT, correction="relabel")),
-    Rung("pressure, no input", Settings(inputs=())),
-    Rung("pressure, bp", Settings(correction="bp")),
-    Rung("pressure, relabel", Settings()),
-    Rung("pressure, all 25 inputs", Settings(inputs=NAMES)),
-    Rung("pressure, relabel, 1 round", Settings(rounds=1)),
-    Rung("pressure, relabel, 2 rounds", Settings(rounds=2)),
+VARIANTS = (
+    Variant("previous acceleration", replace(DIRECT, correction="none"), persistence),
+    Variant("ridge, 23 features", replace(DIRECT, correction="none"), ridge),
+    Variant("direct, bp", replace(DIRECT, correction="bp")),
+    Variant("direct, periodic", replace(DIRECT, correction="periodic")),
+    Variant("direct, relabel", replace(DIRECT, correction="relabel")),
+    Variant("pressure, no input", Settings(inputs=())),
+    Variant("pressure, bp", Settings(correction="bp")),
+    Variant("pressure, relabel", Settings()),
+    Variant("pressure, all 25 inputs", Settings(inputs=NAMES)),
+    Variant("pressure, relabel, 1 round", Settings(rounds=1)),
+    Variant("pressure, relabel, 2 rounds", Settings(rounds=2)),
 )
 
 GROUPS = {
@@ -99,77 +99,111 @@ GROUPS = {
 }
 """Features that are left out together."""
 ABLATIONS = (
-    Rung("pressure, all 25 inputs", Settings(inputs=NAMES)),
+    Variant("pressure, all 25 inputs", Settings(inputs=NAMES)),
     *(
-        Rung(f"all but {name}", Settings(inputs=tuple(n for n in NAMES if n not in group)))
+        Variant(f"all but {name}", Settings(inputs=tuple(n for n in NAMES if n not in group)))
         for name, group in GROUPS.items()
     ),
-    Rung("pressure, relabel", Settings()),
-    Rung("pressure, no input", Settings(inputs=())),
+    Variant("pressure, relabel", Settings()),
+    Variant("pressure, no input", Settings(inputs=())),
 )
-"""Rungs of `--ablate`."""
-ORDER = list(dict.fromkeys(rung.name for rung in (*RUNGS, *ABLATIONS)))
+"""Variants of `--ablate`."""
+ORDER = list(dict.fromkeys(rung.name for rung in (*VARIANTS, *ABLATIONS)))
 
 
 @dataclass(frozen=True)
-class Task:
-    """One rung on one dataset with one seed."""
+class Row:
+    """What a network did on a run that nothing had looked at."""
+
+    rung: str
+    """Name of the variant."""
+    data: str
+    substeps: int
+    sound_speed: float
+    """[m/s]"""
+    seed: int
+    training_seconds: float
+    survived: float
+    path_error: float
+    drained_error: float
+    compression_p99: float
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Dataset, variant and seed."""
+        return self.data, self.rung, self.seed
+
+
+@dataclass(frozen=True)
+class Job:
+    """One variant on one dataset with one seed."""
 
     data: Path
-    rung: Rung
+    data_name: str
+    """Name of the dataset, wherever it is read."""
+    variant: str
+    """Name of the variant: its functions stay here."""
     seed: int
     iterations: int
     arch: str
 
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Dataset, variant and seed."""
+        return self.data_name, self.variant, self.seed
 
-def measure(task: Task) -> dict[str, Any]:
-    """Train and roll out; needs a process of its own, since it starts Taichi."""
+    def __str__(self) -> str:
+        return f"{self.data_name}, {self.variant}, seed {self.seed}"
+
+
+def measure(job: Job) -> list[Row]:
+    """Train and roll out; starts Taichi."""
     from taichi_sph.runtime import start
 
     use_threads(1)
-    start(task.arch, "f32", 1, random_seed=task.seed)
-    rung = task.rung
-    settings = replace(rung.settings, seed=task.seed, iterations=task.iterations)
-    with Dataset(task.data) as file:
+    start(job.arch, "f32", 1, random_seed=job.seed)
+    variant = next(v for v in (*VARIANTS, *ABLATIONS) if v.name == job.variant)
+    settings = replace(variant.settings, seed=job.seed, iterations=job.iterations)
+    with Dataset(job.data) as file:
         last = len(file.runs) - 1
         course = TrainingRuns(file, [0, last])
         before = time.perf_counter()
-        if rung.fit is None:
+        if variant.fit is None:
             with tempfile.TemporaryDirectory() as folder:
                 out = Path(folder) / "weights.npz"
-                weights, _ = train_weights(course, out, settings, report=_quiet)
+                weights, _ = train_weights(
+                    course, out, settings, report=lambda at: report(at.iteration / job.iterations)
+                )
         else:
-            weights = rung.fit(course, settings)
+            weights = variant.fit(course, settings)
         trained = time.perf_counter() - before
         run = course.held[-1]
         figures = course.rollout(course.pcnet(weights), run)
-        return {
-            "rung": rung.name,
-            "data": task.data.name,
-            "substeps": run.facts.substeps,
-            "sound_speed": run.facts.sound_speed,
-            "seed": task.seed,
-            "training_seconds": trained,
-            **figures,
-        }
+        return [
+            Row(
+                rung=job.variant,
+                data=job.data_name,
+                substeps=run.facts.substeps,
+                sound_speed=run.facts.sound_speed,
+                seed=job.seed,
+                training_seconds=trained,
+                **figures,
+            )
+        ]
 
 
-def _quiet(_: object) -> None:
-    """Report nothing."""
-
-
-def _read(out: Path, iterations: int) -> list[dict[str, Any]]:
+def read_figures(out: Path, iterations: int) -> list[Row]:
     """Rows measured before.
 
     Raises:
-        InputError: the file is not a ladder's, or of trainings of another length.
+        InputError: the file is not a comparison's, or of trainings of another length.
     """
     if not out.exists() or not out.stat().st_size:
         return []
     try:
-        found = json.loads(out.read_text())
-        rows, before = found["rows"], found["iterations"]
-    except (ValueError, KeyError):
+        found = json.loads(out.read_text(encoding="utf-8"))
+        rows, before = msgspec.convert(found["rows"], list[Row]), found["iterations"]
+    except (ValueError, KeyError, TypeError):
         raise InputError(
             f"--out {out}: not the figures of a ladder, or cut; name another"
         ) from None
@@ -190,45 +224,48 @@ def main(
     processes: int,
     plot: Path | None,
     arch: str,
+    scheduler: str | None = None,
 ) -> None:
     """Measure what is not yet in `out`, and print the table.
 
     Raises:
         InputError: a dataset cannot be read, or `out` holds something else.
+        RunError: some could not be measured.
     """
     for path in data:
-        with Dataset(path):
-            pass
-    done = _read(out, iterations)
-    there = {(row["data"], row["rung"], row["seed"]) for row in done}
-    tasks = [
-        Task(path, rung, seed, iterations, arch)
+        with Dataset(path) as file:
+            _ = file.runs[0].scene
+    names = [path.name for path in data]
+    if len(set(names)) < len(names):
+        raise InputError(f"{', '.join(names)}: two datasets of one name; rename one")
+    rows = read_figures(out, iterations)
+    jobs = [
+        Job(path, path.name, variant.name, seed, iterations, arch)
         for path in data
-        for rung in (ABLATIONS if ablate else RUNGS)
+        for variant in (ABLATIONS if ablate else VARIANTS)
         # What is fitted without chance needs no second seed.
-        for seed in range(1 if rung.fit else seeds)
-        if (path.name, rung.name, seed) not in there
+        for seed in range(1 if variant.fit else seeds)
     ]
-    context = multiprocessing.get_context("spawn")
-    # Taichi frees no field: a process for each task.
-    with context.Pool(processes, maxtasksperchild=1) as pool:
-        for row in pool.imap_unordered(measure, tasks):
-            done.append(row)
-            write_json(out, {"iterations": iterations, "rows": done})
-            print(
-                f"{row['data']}, {row['rung']}, seed {row['seed']}: "
-                f"survived {row['survived']:.2f} ({len(done)} done)",
-                file=sys.stderr,
-            )
-    lines = summarise(done)
+
+    def save(found: list[Row]) -> None:
+        write_json(out, {"iterations": iterations, "rows": [asdict(row) for row in found]})
+
+    rows = run_study(rows, jobs, measure, save, tell, "ladder", processes, scheduler)
+    lines = summarise(rows)
     print_table(lines)
     if plot is not None:
         draw(lines, plot)
 
 
+def tell(rows: Sequence[Row]) -> str:
+    """What came of a network."""
+    (row,) = rows
+    return f"{row.data}, {row.rung}, seed {row.seed}: survived {row.survived:.2f}"
+
+
 @dataclass(frozen=True)
 class Line:
-    """A rung on a dataset: medians over its seeds."""
+    """A variant on a dataset: medians over its seeds."""
 
     rung: str
     substeps: int
@@ -243,27 +280,26 @@ class Line:
     training_seconds: float
 
 
-def summarise(rows: list[dict[str, Any]]) -> list[Line]:
-    """A line for each rung and dataset, in the order of RUNGS."""
+def summarise(rows: Sequence[Row]) -> list[Line]:
+    """A line for each variant and dataset, in the order of VARIANTS."""
     lines = []
-    keys = {(row["sound_speed"], row["substeps"], ORDER.index(row["rung"])) for row in rows}
+    keys = {(row.sound_speed, row.substeps, ORDER.index(row.rung)) for row in rows}
     for sound_speed, substeps, k in sorted(keys):
         mine = [
             row
             for row in rows
-            if (row["rung"], row["substeps"], row["sound_speed"])
-            == (ORDER[k], substeps, sound_speed)
+            if (row.rung, row.substeps, row.sound_speed) == (ORDER[k], substeps, sound_speed)
         ]
 
-        def median(name: str, mine: list[dict[str, Any]] = mine) -> float:
-            return statistics.median(row[name] for row in mine)
+        def median(name: str, mine: list[Row] = mine) -> float:
+            return statistics.median(getattr(row, name) for row in mine)
 
         lines.append(
             Line(
                 ORDER[k],
                 substeps,
                 sound_speed,
-                sum(row["survived"] == 1.0 for row in mine),
+                sum(row.survived == 1.0 for row in mine),
                 len(mine),
                 median("survived"),
                 median("path_error"),
@@ -276,9 +312,9 @@ def summarise(rows: list[dict[str, Any]]) -> list[Line]:
 
 
 def print_table(lines: list[Line]) -> None:
-    """The ladder for people."""
+    """The comparison for people."""
     found = table(
-        "rollouts on a run never seen: medians over seeds, up to a death",
+        "rollouts on a run never seen: medians over seeds, up to a failure",
         "rung", "c m/s", "M", "alive", "survived", "path", "drained", "p99", "training s",
     )  # fmt: skip
     for line in lines:

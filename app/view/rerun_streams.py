@@ -3,7 +3,6 @@
 import errno
 import os
 import queue
-import select
 import socket
 import threading
 import time
@@ -14,6 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from taichi_sph.errors import InputError
+from taichi_sph.system import has_bytes, named_pipe
 
 LIVE_MEMORY = "64MiB"
 """What the server keeps of the past for viewers that come late; it takes twice that."""
@@ -49,24 +49,31 @@ class FileWriter:
         """
         self.path = path
         self.error: OSError | None = None
+        self._sink: int | None
         try:
             self._file = open(path, "wb", buffering=0)  # noqa: SIM115
         except OSError as error:
             raise InputError(f"--rrd {path}: cannot be written: {error.strerror}") from None
-        self._pumping = threading.Lock()
-        self._source, self._sink = os.pipe()
-        self.sink_path = f"/dev/fd/{self._sink}"
         self._thread = threading.Thread(target=self._pump, daemon=True, name="recording")
+        pipe = named_pipe()
+        if pipe is None:  # Rerun writes the file itself, and says less of a full disk
+            self._file.close()
+            self._sink, self.sink_path = None, str(path)
+            return
+        self._pumping = threading.Lock()
+        self._source, sink, self.sink_path = pipe
+        self._sink = sink
         self._thread.start()
 
     def opened(self) -> None:
         """Rerun has opened the pipe: it alone holds the writing end now."""
-        os.close(self._sink)
+        if self._sink is not None:
+            os.close(self._sink)
 
     def _pump(self) -> None:
         data = b"all"
         while data:
-            self._waits(None)
+            has_bytes(self._source, None)
             with self._pumping:
                 data = os.read(self._source, 1 << 20)
                 rest = memoryview(data)
@@ -85,12 +92,6 @@ class FileWriter:
             os.close(self._source)
             self._file.close()
 
-    def _waits(self, patience: int | None) -> bool:
-        """Whether bytes are in the pipe, or come before so long [ms], or it is closed."""
-        asked = select.poll()
-        asked.register(self._source, select.POLLIN)
-        return bool(asked.poll(patience))
-
     def drain(self) -> None:
         """Wait until the pipe is empty and what was in it is in the file, or cannot be.
 
@@ -100,7 +101,7 @@ class FileWriter:
         end = time.monotonic() + DISK_TIMEOUT
         while self._thread.is_alive() and not self.error:
             if self._pumping.acquire(timeout=DISK_TIMEOUT):
-                waiting = self._waits(0)
+                waiting = has_bytes(self._source, 0)
                 self._pumping.release()
                 if not waiting:
                     return
@@ -131,9 +132,12 @@ class FileWriter:
         Raises:
             OSError: as `check`, or the disk does not answer.
         """
-        self._thread.join(DISK_TIMEOUT)
-        if self._thread.is_alive():
-            raise self.timeout_error
+        if self._sink is not None:
+            self._thread.join(DISK_TIMEOUT)
+            if self._thread.is_alive():
+                raise self.timeout_error
+        elif not self.path.stat().st_size:
+            raise OSError(f"{self.path}: the recording cannot be written")
         self.check()
 
 
@@ -169,7 +173,8 @@ class LiveView:
             InputError: the port is taken.
         """
         with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if os.name == "posix":  # Windows would take a port that is in use
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind(("127.0.0.1", port))
             except OSError as error:

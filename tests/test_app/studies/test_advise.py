@@ -21,21 +21,21 @@ from app.studies.advise import (
     Advice,
     Candidate,
     Probe,
+    advisable,
     candidates,
-    checked,
+    check_advice,
     choose,
     expected,
-    listed,
-    lived,
     ratio,
+    survival,
     yield_sentence,
 )
 from app.studies.chart import Row
 from app.studies.methods import METHODS, SOFT, Method
-from app.studies.stability import Row as Trial
+from app.studies.stability import Row as StabilityRow
 from app.studies.timed_run import Trace
 from chart_rows import ROW
-from taichi_sph.errors import RunError
+from taichi_sph.errors import InputError, RunError
 
 RAMP_TIME = 0.2
 POURED = [m for m in METHODS if m.curve in PROBED]
@@ -74,16 +74,16 @@ def charted(**deaths: str) -> list[Row]:
     ]
 
 
-def trials(name: str, deaths: int, case: str = "low column") -> list[Trial]:
+def runs(name: str, deaths: int, case: str = "low column") -> list[StabilityRow]:
     """Twenty starts of a method in a case."""
     return [
-        Trial(name, case, k, 1.0, "dead" if k < deaths else "", 0, 0.0, 0.0, 0, 0.0)
+        StabilityRow(name, case, k, 1.0, "dead" if k < deaths else "", 0, 0.0, 0.0, 0, 0.0)
         for k in range(20)
     ]
 
 
 LONG = ("pcnet", "implicit, 0 rounds")
-SAFE = [t for name in ("physics", *LONG) for t in trials(name, 0)]
+SAFE = [t for name in ("physics", *LONG) for t in runs(name, 0)]
 
 
 def test_errors_of_first_order_are_found():
@@ -110,7 +110,9 @@ def test_what_a_method_is_to_another_is_a_mean_over_scenes():
     assert math.isnan(ratio(rows, [Method("nobody", "")], {1.0: "base"}, "energy"))
 
 
-def by_name(probes: list[Probe], rows: list[Row], cases: list[Trial]) -> dict[str, Candidate]:
+def by_name(
+    probes: list[Probe], rows: list[Row], cases: list[StabilityRow]
+) -> dict[str, Candidate]:
     """What is listed, by name, by the kinetic energy."""
     return {c.method.name: c for c in candidates(probes, rows, cases, ("energy",))}
 
@@ -143,24 +145,27 @@ def test_what_died_is_not_advised():
     *costs, unknown = (c.wall_per_simulated for c in found.values())
     assert math.isnan(unknown)  # of "physics, 2 d", whose death has no cost: it stands last
     assert costs == sorted(costs)
-    assert found["pcnet, 2 d"].unfit == "died here: it leaked"
-    assert "compressed by 11 %" in found["physics, 2 d"].unfit
-    assert found["pcnet"].unfit == ""
-    assert found[SOFT.name].unfit.startswith("lived through 0 of 0 starts")
-    dying = [t for t in SAFE if t.method != "pcnet"] + trials("pcnet", 2)
+    assert found["pcnet, 2 d"].rejected_because == "died here: it leaked"
+    assert "compressed by 11 %" in found["physics, 2 d"].rejected_because
+    assert found["pcnet"].rejected_because == ""
+    assert found[SOFT.name].rejected_because.startswith("lived through 0 of 0 starts")
+    dying = [t for t in SAFE if t.method != "pcnet"] + runs("pcnet", 2)
     found = by_name(probes, rows, dying)
-    assert found["pcnet"].unfit == "lived through 18 of 20 starts that the physics lives through"
+    assert (
+        found["pcnet"].rejected_because
+        == "lived through 18 of 20 starts that the physics lives through"
+    )
 
 
 def test_only_cases_that_the_physics_lives_through_count():
-    hard = trials("physics", 20, "high column") + trials("pcnet", 20, "high column")
-    steps = trials("physics", 0, "step x 2") + trials("pcnet", 20, "step x 2")
-    assert lived([*SAFE, *hard, *steps], PCNET) == (20, 20)
+    hard = runs("physics", 20, "high column") + runs("pcnet", 20, "high column")
+    steps = runs("physics", 0, "step x 2") + runs("pcnet", 20, "step x 2")
+    assert survival([*SAFE, *hard, *steps], PCNET) == (20, 20)
 
 
-def candidate(name: str, wall: float, error: float, unfit: str = "") -> Candidate:
+def candidate(name: str, wall: float, error: float, rejected_because: str = "") -> Candidate:
     """One with a name."""
-    return Candidate(Method(name, ""), error, wall, unfit)
+    return Candidate(Method(name, ""), error, wall, rejected_because)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +223,35 @@ def test_what_dies_when_it_is_poured_gives_way(monkeypatch: pytest.MonkeyPatch):
     assert "25 % of the blood is at rest" in advice.text
 
 
+def still(method: Method) -> Probe:
+    """A run whose blood stays where it is, but for a tenth of a spacing."""
+    probe = poured(method)
+    centre = [np.array([0.0, 0.0, -1e-4 * (k % 2)]) for k in range(4)]
+    return replace(probe, trace=replace(probe.trace, spacing=1e-3, centre=centre))
+
+
+def test_of_blood_at_rest_only_the_drained_part_is_judged(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(study, "in_own_process", lambda work, job: still(job.method))
+    monkeypatch.setattr(study, "read_rows", lambda path, row: charted() if row is Row else SAFE)
+    advice = study.advise(SCENE, 0.1, DEFAULT, None, 0.5, "cpu", None)
+    assert "The blood stays where it is" in advice.text
+    assert "kinetic energy off by" not in advice.text
+    with pytest.raises(InputError, match=r"stays where it is for 0\.5 s, so nothing can be said"):
+        study.advise(SCENE, 0.1, ("energy", "field"), None, 0.5, "cpu", None)
+
+
+def test_no_figure_that_is_not_there_is_shown(monkeypatch: pytest.MonkeyPatch):
+    """The cost of a method that died on the chart is not known."""
+    rows = charted(**{"physics, 2 d": "compressed by 11 %"})
+    monkeypatch.setattr(study, "in_own_process", lambda work, job: poured(job.method))
+    monkeypatch.setattr(study, "read_rows", lambda path, row: rows if row is Row else SAFE)
+    advice = study.advise(SCENE, 0.21, ("energy",), None, 0.5, "cpu", None)
+    assert any(math.isnan(c.wall_per_simulated) for c in advice.candidates)
+    cells = [c for column in study.candidates_table(SCENE, advice).columns for c in column.cells]
+    assert "-" in cells
+    assert not any("nan" in str(c) for c in cells) and "nan" not in advice.text
+
+
 def test_what_is_not_safe_is_not_poured(monkeypatch: pytest.MonkeyPatch):
     asked = []
 
@@ -225,23 +259,23 @@ def test_what_is_not_safe_is_not_poured(monkeypatch: pytest.MonkeyPatch):
         asked.append(job.method.name)
         return poured(job.method)
 
-    dying = [t for t in SAFE if t.method != "pcnet"] + trials("pcnet", 2)
+    dying = [t for t in SAFE if t.method != "pcnet"] + runs("pcnet", 2)
     monkeypatch.setattr(study, "in_own_process", stand_in)
     monkeypatch.setattr(study, "read_rows", lambda path, row: charted() if row is Row else dying)
     advice = study.advise(SCENE, 0.21, ("energy",), None, 0.5, "cpu", None)
     assert not any("pcnet" in name for name in asked)
     assert "pcnet" not in advice.method.name
-    assert any(c.method.name == "pcnet" and c.unfit for c in advice.candidates)
+    assert any(c.method.name == "pcnet" and c.rejected_because for c in advice.candidates)
 
 
 def test_the_evidence_has_every_listed_method():
     """What comes with the program is of the methods that it lists."""
     rows = read_rows(EVIDENCE / "chart.csv", Row)
-    cases = read_rows(EVIDENCE / "stability.csv", Trial)
-    assert {row.method for row in rows} >= {m.name for m in listed()}
-    for method in listed():
-        assert lived(cases, method)[1] > 0, method.name
-    assert {"pcnet", "implicit", "physics"} <= {m.name for m in listed()}
+    cases = read_rows(EVIDENCE / "stability.csv", StabilityRow)
+    assert {row.method for row in rows} >= {m.name for m in advisable()}
+    for method in advisable():
+        assert survival(cases, method)[1] > 0, method.name
+    assert {"pcnet", "implicit", "physics"} <= {m.name for m in advisable()}
 
 
 def test_the_command_offers_what_there_is_and_refuses_too_short_a_time():
@@ -305,4 +339,4 @@ def test_advice_is_checked(name: str, error: float, said: str, monkeypatch: pyte
     rows.append(replace(rows[0], method="floor", died=""))
     monkeypatch.setattr(study, "main", lambda *_: rows)
     advice = Advice(Method(name, ""), found, "")
-    assert said in checked(SCENE, advice, error, DEFAULT, 0.1, Path("x"), "cpu", None)
+    assert said in check_advice(SCENE, advice, error, DEFAULT, 0.1, Path("x"), "cpu", None)

@@ -188,7 +188,7 @@ def pour(method: Method) -> TimedRun:
 @pytest.mark.parametrize("method", [PEERS[0], PEERS[5]], ids=lambda method: method.name)
 def test_a_short_pour_falls_and_does_not_leak(method: Method) -> None:
     poured = in_own_process(pour, method)
-    assert poured.death == ""
+    assert poured.failure == ""
     assert poured.most_leaks == 0
     energy = poured.trace.energy
     # 15 ms of free fall at the most, and most of it.
@@ -206,4 +206,4 @@ def test_methods_of_the_peer_have_names_of_their_own_and_scale_with_the_scene() 
 def test_a_peer_that_is_not_installed_is_one_sentence(monkeypatch) -> None:
     monkeypatch.setattr("app.studies.splishsplash.has_peer", lambda: False)
     with pytest.raises(InputError, match=r"^--peer: pysplishsplash is not installed"):
-        chart.asked([], "", True)
+        chart.select_methods([], "", True)

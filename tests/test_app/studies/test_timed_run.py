@@ -139,6 +139,6 @@ def test_a_run_that_diverges_is_dead_from_then_on():
     pour = TimedRun("x", made, Trace(0.1), rules=RULES)  # type: ignore[arg-type]
     for k in range(1, 5):
         pour.frame(0.1 * k)
-    assert pour.death == "the run diverged"
+    assert pour.failure == "the run diverged"
     assert len(pour.trace.drained) == 1
     assert math.isnan(pour.wall_per_simulated)
