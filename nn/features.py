@@ -1,4 +1,4 @@
-"""The particle state features of the paper's section 2.1: 23 numbers a blood particle.
+"""Particle state features: the 23 of the paper's section 2.1, and four more, of each particle.
 
 | # | feature | definition | unit | seen by the network times |
 |---|---|---|---|---|
@@ -17,6 +17,10 @@
 | 20 | variance of r_ik | 0 for M = 0 | m^2 | 1/R^2 |
 | 21 | skewness of the binned r_ik | 0 where the bins' variance is 0 | - | 1 |
 | 22 | kurtosis of the binned r_ik | likewise | - | 1 |
+| 23 | compression | max(rho/rho_0 - 1, 0): density is not among the paper's | - | 50 |
+| 24 | divergence | div v, the rate at which that density falls | 1/s | T |
+| 25 | rho/rho_0 | by Eq. 2; no network sees it | - | 1 |
+| 26 | response | D of `taichi_sph.fluid.density`; no network sees it | 1/m^2 | R^2 |
 
 T is the frame interval, R the support radius, N_0 the neighbours of a lattice and U the speed that
 the bins of v_ij span.  The six bins of a distance span [0, R] as printed, l_b = b R/6.  The paper
@@ -32,13 +36,22 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from taichi_sph.fluid.density import density_of, density_rate, density_response, pair_gradient
 from taichi_sph.particles.wall import wall_velocity
 
-COUNT = 23
-EXTENDED = 25
-"""With two more, for density is not among the paper's: 50 max(rho/rho_0 - 1, 0) and T div v."""
-GATHERED = 27
-"""With what no network sees: rho/rho_0 and the response of the density (see `features_of`)."""
+ACCELERATION, NEIGHBOURS, POSITION, VELOCITY = 0, 3, 4, 7
+DISTANCE_VARIANCE, SPEED_VARIANCE = 10, 11
+DISTANCE_SKEWNESS, SPEED_SKEWNESS, DISTANCE_KURTOSIS, SPEED_KURTOSIS = 12, 13, 14, 15
+PROXIES, PROXY_POSITION, PROXY_VARIANCE, PROXY_SKEWNESS, PROXY_KURTOSIS = 16, 17, 20, 21, 22
+COMPRESSION, DIVERGENCE, DENSITY_RATIO, RESPONSE = 23, 24, 25, 26
+"""Rows of the table above; those of vectors are the first of three."""
+
+PAPER_COUNT = 23
+"""Number of the paper's features, the first rows."""
+NETWORK_COUNT = 25
+"""Number of the features that a network may see."""
+ROW_COUNT = 27
+"""Number of all rows."""
 BINS = 6
 TABLE_VERSION = 2
 """Raised when a definition above changes; weights of another version are refused."""
@@ -99,14 +112,14 @@ class Inputs:
     """Which features a network sees; the kernels work out no others."""
 
     index: tuple[int, ...]
-    """Rows of the table above, then compression and divergence."""
+    """Rows of the table above, those of NETWORK_COUNT."""
 
     def among(self, *rows: int) -> bool:
         """Whether any of these rows is seen."""
         return any(row in self.index for row in rows)
 
 
-ALL = Inputs(tuple(range(EXTENDED)))
+ALL = Inputs(tuple(range(NETWORK_COUNT)))
 
 
 @ti.func
@@ -140,37 +153,35 @@ def bin_of(q):
 
 
 @ti.func
-def features_of(
+def put_moments(f: ti.template(), skewness: ti.template(), kurtosis: ti.template(), n, s):
+    """Write skewness and kurtosis into two rows, from the power sums of n bin numbers."""
+    shape = central_moments(n, s[0], s[1], s[2], s[3])
+    f[skewness] = shape[0]
+    f[kurtosis] = shape[1]
+
+
+@ti.func
+def blood_features(
+    f: ti.template(),
     i,
     p: ti.template(),
-    w: ti.template(),
     nb: ti.template(),
     fluid: ti.template(),
     scales: ti.template(),
     inputs: ti.template(),
 ):
-    """The 23 features of particle i, dimensionless (last column of the table), and four more.
+    """Write rows 3 to 15 of particle i; lengths in R, velocities in U.
 
-    The four are 50 max(rho/rho_0 - 1, 0) by Eq. 2, T div v (the rate at which that density falls),
-    and, which no network sees, rho/rho_0 and R^2 (|sum_j G_j|^2 + sum_j |G_j|^2): how much the
-    density answers to a pressure of the particle itself, with G = grad W m/rho_0, the wall's in the
-    first sum only (Bender and Koschier 2017, doi:10.1109/TVCG.2016.2578335, eq. 9).
-    What `inputs` leaves out is 0.  Reads: position, velocity, acceleration.
+    Returns: sum_j W_ij, W(0) included, sum_j v_ij.grad W_ij, sum_j grad W_ij, sum_j |grad W_ij|^2.
     """
-    f = ti.Vector([0.0] * GATHERED)
     x_i = p.position[i]
     v_i = p.velocity[i]
-    if ti.static(inputs.among(0, 1, 2)):
-        a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
-        for a in ti.static(range(3)):
-            f[a] = a_i[a]
     per_length = ti.static(1.0 / scales.support_radius)
     per_speed = ti.static(1.0 / scales.speed)
-
     blood = fluid.kernel.w(0.0)
-    blood_rate = 0.0
+    rate = 0.0
     gradient = ti.Vector([0.0, 0.0, 0.0])
-    gradient2 = 0.0
+    square = 0.0
     n = 0.0
     r_sum = ti.Vector([0.0, 0.0, 0.0])
     v_sum = ti.Vector([0.0, 0.0, 0.0])
@@ -187,90 +198,125 @@ def features_of(
             n += 1.0
             r = q * ti.static(scales.support_radius)
             blood += fluid.kernel.w(r)
-            slope = fluid.kernel.slope(r)
-            blood_rate += slope * v_ji.dot(r_ji)
-            gradient += slope * r_ji
-            gradient2 += (slope * q) ** 2
-            if ti.static(inputs.among(4, 5, 6)):
+            # r_ij.v_ij = r_ji.v_ji
+            rate_ij, gradient_ji, square_ij = pair_gradient(
+                fluid.kernel.slope(r), q * q, r_ji, v_ji
+            )
+            rate += rate_ij
+            gradient += gradient_ji
+            square += square_ij
+            if ti.static(inputs.among(POSITION, POSITION + 1, POSITION + 2)):
                 r_sum += r_ji
-            if ti.static(inputs.among(7, 8, 9)):
+            if ti.static(inputs.among(VELOCITY, VELOCITY + 1, VELOCITY + 2)):
                 v_sum += v_ji
-            if ti.static(inputs.among(10)):
+            if ti.static(inputs.among(DISTANCE_VARIANCE)):
                 # From the middle of its range: the variance then loses no digits.
                 distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
-            if ti.static(inputs.among(12, 14)):
+            if ti.static(inputs.among(DISTANCE_SKEWNESS, DISTANCE_KURTOSIS)):
                 b = bin_of(q)
                 distance_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
-            if ti.static(inputs.among(11, 13, 15)):
+            if ti.static(inputs.among(SPEED_VARIANCE, SPEED_SKEWNESS, SPEED_KURTOSIS)):
                 u = v_ji.norm()
                 speed += ti.Vector([u, u * u])
-                if ti.static(inputs.among(13, 15)):
+                if ti.static(inputs.among(SPEED_SKEWNESS, SPEED_KURTOSIS)):
                     c = bin_of(u)
                     speed_bins += ti.Vector([c, c * c, c * c * c, c * c * c * c])
     if n > 0.0:
-        f[3] = n * ti.static(1.0 / scales.neighbours)
+        f[NEIGHBOURS] = n * ti.static(1.0 / scales.neighbours)
         for a in ti.static(range(3)):
-            f[4 + a] = r_sum[a] / n
-            f[7 + a] = v_sum[a] / n
-        f[10] = ti.max(0.0, distance[1] / n - (distance[0] / n) ** 2)
-        f[11] = ti.max(0.0, speed[1] / n - (speed[0] / n) ** 2)
-        if ti.static(inputs.among(12, 14)):
-            s = distance_bins
-            shape = central_moments(n, s[0], s[1], s[2], s[3])
-            f[12] = shape[0]
-            f[14] = shape[1]
-        if ti.static(inputs.among(13, 15)):
-            s2 = speed_bins
-            shape2 = central_moments(n, s2[0], s2[1], s2[2], s2[3])
-            f[13] = shape2[0]
-            f[15] = shape2[1]
+            f[POSITION + a] = r_sum[a] / n
+            f[VELOCITY + a] = v_sum[a] / n
+        f[DISTANCE_VARIANCE] = ti.max(0.0, distance[1] / n - (distance[0] / n) ** 2)
+        f[SPEED_VARIANCE] = ti.max(0.0, speed[1] / n - (speed[0] / n) ** 2)
+        if ti.static(inputs.among(DISTANCE_SKEWNESS, DISTANCE_KURTOSIS)):
+            put_moments(f, DISTANCE_SKEWNESS, DISTANCE_KURTOSIS, n, distance_bins)
+        if ti.static(inputs.among(SPEED_SKEWNESS, SPEED_KURTOSIS)):
+            put_moments(f, SPEED_SKEWNESS, SPEED_KURTOSIS, n, speed_bins)
+    return blood, rate, gradient, square
 
-    behind = 0.0
-    wall_gradient = ti.Vector([0.0, 0.0, 0.0])
-    wall_rate = 0.0
+
+@ti.func
+def wall_features(
+    f: ti.template(),
+    i,
+    p: ti.template(),
+    w: ti.template(),
+    nb: ti.template(),
+    fluid: ti.template(),
+    scales: ti.template(),
+    inputs: ti.template(),
+):
+    """Write rows 16 to 22 of particle i; lengths in R.
+
+    Returns: sum_k V_k W_ik, sum_k V_k v_ki.grad W_ki with v_ki in m/s, and sum_k V_k grad W_ki.
+    """
+    x_i = p.position[i]
+    wall = 0.0
+    rate = 0.0
+    gradient = ti.Vector([0.0, 0.0, 0.0])
     m = 0.0
-    wall_sum = ti.Vector([0.0, 0.0, 0.0])
-    wall_distance = ti.Vector([0.0, 0.0])
-    wall_bins = ti.Vector([0.0, 0.0, 0.0, 0.0])
-    for k in range(nb.wall_count[i]):
-        kk = nb.wall_index[i, k]
-        r_ki = -nb.grid.separation(x_i, w.position[kk]) * per_length
+    r_sum = ti.Vector([0.0, 0.0, 0.0])
+    distance = ti.Vector([0.0, 0.0])
+    bins = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    for n in range(nb.wall_count[i]):
+        k = nb.wall_index[i, n]
+        r_ki = -nb.grid.separation(x_i, w.position[k]) * ti.static(1.0 / scales.support_radius)
         q = r_ki.norm()
         if q < 1.0:
             m += 1.0
             r = q * ti.static(scales.support_radius)
-            behind += w.volume[kk] * fluid.kernel.w(r)
-            wall_gradient += (w.volume[kk] * fluid.kernel.slope(r)) * r_ki
+            wall += w.volume[k] * fluid.kernel.w(r)
+            slope = w.volume[k] * fluid.kernel.slope(r)
+            rate_k, gradient_k, _ = pair_gradient(slope, 0.0, r_ki, wall_velocity(w, k))
+            gradient += gradient_k
             if ti.static(w.moves):
-                slope = w.volume[kk] * fluid.kernel.slope(r)
-                wall_rate += slope * wall_velocity(w, kk).dot(r_ki)
-            if ti.static(inputs.among(17, 18, 19)):
-                wall_sum += r_ki
-            if ti.static(inputs.among(20)):
-                wall_distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
-            if ti.static(inputs.among(21, 22)):
+                rate += rate_k
+            if ti.static(inputs.among(PROXY_POSITION, PROXY_POSITION + 1, PROXY_POSITION + 2)):
+                r_sum += r_ki
+            if ti.static(inputs.among(PROXY_VARIANCE)):
+                distance += ti.Vector([q - 0.5, (q - 0.5) * (q - 0.5)])
+            if ti.static(inputs.among(PROXY_SKEWNESS, PROXY_KURTOSIS)):
                 b = bin_of(q)
-                wall_bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
+                bins += ti.Vector([b, b * b, b * b * b, b * b * b * b])
     if m > 0.0:
-        f[16] = m * ti.static(1.0 / scales.proxies)
+        f[PROXIES] = m * ti.static(1.0 / scales.proxies)
         for a in ti.static(range(3)):
-            f[17 + a] = wall_sum[a] / m
-        f[20] = ti.max(0.0, wall_distance[1] / m - (wall_distance[0] / m) ** 2)
-        if ti.static(inputs.among(21, 22)):
-            s3 = wall_bins
-            shape3 = central_moments(m, s3[0], s3[1], s3[2], s3[3])
-            f[21] = shape3[0]
-            f[22] = shape3[1]
-    # d(rho_i)/dt = sum_j m slope r_ij.v_ij, and r_ij.v_ij = r_ji.v_ji.
-    share = ti.static(fluid.calibration.mass / fluid.equation_of_state.rest_density)
-    gamma = ti.static(fluid.calibration.wall_density)
-    f[25] = share * blood + gamma * behind
-    f[23] = 50.0 * ti.max(0.0, f[25] - 1.0)
-    rate = share * blood_rate * ti.static(scales.speed)
-    rate += gamma * (wall_rate - v_i.dot(wall_gradient))
-    f[24] = -rate * ti.static(scales.support_radius * scales.frame_interval)
-    one_sided = share * gradient + gamma * wall_gradient
-    f[26] = ti.static(scales.support_radius**4) * (one_sided.norm_sqr() + share**2 * gradient2)
+            f[PROXY_POSITION + a] = r_sum[a] / m
+        f[PROXY_VARIANCE] = ti.max(0.0, distance[1] / m - (distance[0] / m) ** 2)
+        if ti.static(inputs.among(PROXY_SKEWNESS, PROXY_KURTOSIS)):
+            put_moments(f, PROXY_SKEWNESS, PROXY_KURTOSIS, m, bins)
+    return wall, rate - p.velocity[i].dot(gradient), gradient
+
+
+@ti.func
+def features_of(
+    i,
+    p: ti.template(),
+    w: ti.template(),
+    nb: ti.template(),
+    fluid: ti.template(),
+    scales: ti.template(),
+    inputs: ti.template(),
+):
+    """All rows of the table for particle i, dimensionless (its last column).
+
+    Of the rows that a network may see, those that `inputs` leaves out are 0.
+    Reads: position, velocity, acceleration.
+    """
+    f = ti.Vector([0.0] * ROW_COUNT)
+    if ti.static(inputs.among(ACCELERATION, ACCELERATION + 1, ACCELERATION + 2)):
+        a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
+        for a in ti.static(range(3)):
+            f[ACCELERATION + a] = a_i[a]
+    blood, blood_rate, blood_gradient, square = blood_features(f, i, p, nb, fluid, scales, inputs)
+    wall, wall_rate, wall_gradient = wall_features(f, i, p, w, nb, fluid, scales, inputs)
+    f[DENSITY_RATIO] = density_of(fluid, fluid.rest_density, blood, wall)
+    f[COMPRESSION] = 50.0 * ti.max(0.0, f[DENSITY_RATIO] - 1.0)
+    rate = density_rate(fluid, blood_rate * ti.static(scales.speed), wall_rate)
+    f[DIVERGENCE] = -rate * ti.static(scales.support_radius * scales.frame_interval)
+    # Lengths in the gradients are in R: R^2 D is R^4 times what they give.
+    response = density_response(fluid, blood_gradient, wall_gradient, square)
+    f[RESPONSE] = ti.static(scales.support_radius**4) * response
     return f
 
 
@@ -283,8 +329,8 @@ def extract(
     scales: ti.template(),
     out: ti.types.ndarray(dtype=float, ndim=2),
 ):
-    """What `features_of` gives, for every live particle.  Writes: out[identity, 27]."""
+    """What `features_of` gives, for every live particle.  Writes: out[identity, ROW_COUNT]."""
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, ALL)
-        for k in ti.static(range(GATHERED)):
+        for k in ti.static(range(ROW_COUNT)):
             out[p.identity[i], k] = f[k]

@@ -7,14 +7,14 @@ is pushed apart, the wall pushes in and viscosity dissipates whatever the weight
 
     p_i/rho_i^2 = max(0, k_i (rho_i/rho_0 - 1) - g_i T div v_i) / (T^2 rho_0 D_i)
     mu_i        = min(eta exp(o_2), 0.03 rho_0 R^2/T)
-    k_i = sigmoid(o_0),  g_i = 0.3 sigmoid(o_1)          (0.8 and 0.1 without rounds)
+    k_i = sigmoid(o_0),  g_i = 0.3 sigmoid(o_1)          (0.8 and 0.1 without iterations)
 
-It is the first guess of `taichi_sph.fluid.implicit`, whose rounds follow: as many as the weights
-were trained with.  Without any, a step is stable where k + 2 g stays under 4/3.8; the factors hold
-that, and what the rounds need, for any weights.  Weakly compressible SPH, linearised, is
-k = (c T/R)^2 R^2 D, g = 0.  Viscosity is learned as a multiple of the blood's own at high shear,
-eta; its bound is what an explicit step T bears (Morris et al. 1997).  Monaghan's artificial term
-stays as the scene has it.
+It is the initial pressure of `taichi_sph.fluid.implicit`, whose iterations follow: as many as the
+weights were trained with.  Without any, a step is stable where k + 2 g stays under 4/3.8; the
+factors hold that, and what the iterations need, for any weights.  Weakly compressible SPH,
+linearised, is k = (c T/R)^2 R^2 D, g = 0.  Viscosity is learned as a multiple of the blood's own
+at high shear, eta; its bound is what an explicit step T bears (Morris et al. 1997).  Monaghan's
+artificial term stays as the scene has it.
 
 Everything is dimensionless, so weights serve any spacing whose scene has the same proportions:
 the step is T = C R/c with the trained C, the sound speed c and the support radius R the scene's.
@@ -28,19 +28,27 @@ from pathlib import Path
 import numpy as np
 import taichi as ti
 
-from nn.features import FeatureScales, Inputs, features_of
+from nn.features import (
+    DENSITY_RATIO,
+    DIVERGENCE,
+    RESPONSE,
+    FeatureScales,
+    Inputs,
+    features_of,
+)
 from nn.weights import CLIP, Weights, dimensionless_numbers, require_fit
 from taichi_sph.fluid.implicit import (
     DAMPING,
-    LARGEST_ADVANCE,
+    LARGEST_ADVECTIVE_CFL,
     LARGEST_VISCOSITY,
-    LEAST_RESPONSE,
+    SMALLEST_DIAGONAL,
     STIFFNESS,
     ImplicitAcceleration,
-    step_within_reach,
+    advective_step,
 )
+from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import Casson
-from taichi_sph.fluid.wcsph import Fluid, SphAcceleration
+from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall
@@ -54,9 +62,9 @@ LARGEST_COMPRESSION = 0.1
 """What the direct head may let happen; the physics stays under 0.02."""
 
 
-def largest_factors(rounds: int) -> tuple[float, float]:
-    """Bounds of k and g that keep any weights stable."""
-    return (STIFFNESS, DAMPING) if rounds else (0.8, 0.1)
+def largest_factors(iterations: int) -> tuple[float, float]:
+    """Bounds of k and g that keep any weights stable, with so many iterations."""
+    return (STIFFNESS, DAMPING) if iterations else (0.8, 0.1)
 
 
 @dataclass(eq=False)
@@ -199,38 +207,47 @@ class DirectPcNet:
             copy_vectors(particles, self.next_acceleration)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
-        """The trained step [s], or less: LARGEST_ADVANCE at most, or the physics' own."""
+        """The trained step [s], or less: LARGEST_ADVECTIVE_CFL at most, or the physics' own."""
         if self.used_fallback:
             return self.physics.stable_step(largest_speed, largest_acceleration)
-        return step_within_reach(
-            self.scales.frame_interval, self.scales.support_radius, largest_speed
-        )
+        return advective_step(self.scales.frame_interval, self.scales.support_radius, largest_speed)
 
 
-class PressurePcNet(ImplicitAcceleration):
-    """The default head: the network makes the first guess of the pressure.
+class PressurePcNet:
+    """The default head: the network estimates the initial pressure of the implicit model.
 
     It cannot run away, and the physics must not guard it: what a soft pressure has let come close,
     stiff physics throws apart.  (It killed a run that lives without.)
     """
 
     name = "pcnet"
+    used_fallback = False
 
     def __init__(self, weights: Weights, fluid: Fluid, scales: FeatureScales, capacity: int):
         """Make the scratch fields for `capacity` particles."""
-        rounds = weights.training.rounds
-        super().__init__(fluid, capacity, scales.frame_interval, rounds)
-        self.eta = fluid.rheology.eta
-        self.fluid = replace(self.fluid, rheology=VARIABLE)
         self.network = Network.upload(weights)
         self.scales = scales
+        self.eta = fluid.rheology.eta
+        self.implicit = ImplicitAcceleration(
+            replace(fluid, rheology=VARIABLE), capacity, scales.frame_interval,
+            weights.training.rounds, self.estimate, self.name,
+        )  # fmt: skip
+        self.accelerate = self.implicit.accelerate
+        self.stable_step = self.implicit.stable_step
 
-    def guess(self, particles: Particles, wall: Wall, neighbors: Neighbors) -> None:
-        """As without a network, by features and network."""
-        stiffness, damping = largest_factors(self.rounds)
+    @property
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field]:
+        """Constants, p/rho^2 and mu of the implicit model."""
+        return self.implicit.pair_coefficients
+
+    def estimate(
+        self, particles: Particles, wall: Wall, neighbors: Neighbors, model: ImplicitAcceleration
+    ) -> None:
+        """Estimate the initial pressure and the viscosity by features and network."""
+        stiffness, damping = largest_factors(model.iterations)
         predict_pressure(
-            particles, wall, neighbors, self.fluid, self.scales, self.network, stiffness, damping,
-            self.eta, self.physics.pressure_term, self.physics.viscosity, self.response,
+            particles, wall, neighbors, model.fluid, self.scales, self.network, stiffness, damping,
+            self.eta, model.pressure_term, model.viscosity, model.diagonal,
         )  # fmt: skip
 
 
@@ -249,7 +266,7 @@ def make_pcnet(
 
 def scales_of(weights: Weights, fluid: Fluid, spacing: float, wall_ratio: float) -> FeatureScales:
     """What features are measured in where blood is `fluid` at a spacing [m]."""
-    radius, sound = fluid.kernel.support_radius, fluid.equation_of_state.sound_speed
+    radius, sound = fluid.kernel.support_radius, fluid.sound_speed
     interval = weights.training.courant_number * radius / sound
     return FeatureScales(radius, spacing, interval, sound, wall_ratio)
 
@@ -275,8 +292,8 @@ def load_pcnet(path: Path, scene: Scene, guarded: bool = True) -> Callable[[Flui
 @ti.func
 def beyond_training(f, velocity, scales: ti.template()):
     """1 if a particle with these features must not be left to a network, else 0."""
-    dense = f[25] > ti.static(1.0 + LARGEST_COMPRESSION)
-    fast = velocity.norm() > ti.static(LARGEST_ADVANCE * scales.speed_limit)
+    dense = f[DENSITY_RATIO] > ti.static(1.0 + LARGEST_COMPRESSION)
+    fast = velocity.norm() > ti.static(LARGEST_ADVECTIVE_CFL * scales.speed_limit)
     return int(dense or fast)
 
 
@@ -298,7 +315,7 @@ def predict_acceleration(
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, network.inputs)
         alarms += beyond_training(f, p.velocity[i], scales)
-        p.density[i] = f[25] * ti.static(fluid.equation_of_state.rest_density)
+        p.density[i] = f[DENSITY_RATIO] * ti.static(fluid.rest_density)
         o = evaluate(network, f)
         for a in ti.static(range(3)):
             out[i][a] = o[a] * ti.static(scales.acceleration)
@@ -331,27 +348,24 @@ def predict_pressure(
     eta: float,
     pressure_term: ti.template(),
     viscosity: ti.template(),
-    response: ti.template(),
+    diagonal: ti.template(),
 ):
     """The pressure head's q^0, mu and T^2 rho_0 D.
 
-    Writes: pressure_term, viscosity, response, density.
+    Writes: pressure_term, viscosity, diagonal, density.
     """
-    rest_density = ti.static(fluid.equation_of_state.rest_density)
+    rest_density = ti.static(fluid.rest_density)
     thickest = ti.static(
-        LARGEST_VISCOSITY
-        * fluid.equation_of_state.rest_density
-        * scales.support_radius
-        * scales.speed_limit
+        LARGEST_VISCOSITY * fluid.rest_density * scales.support_radius * scales.speed_limit
     )
     for i in range(p.count[None]):
         f = features_of(i, p, w, nb, fluid, scales, network.inputs)
-        p.density[i] = f[25] * rest_density
-        response[i] = ti.static(
-            fluid.equation_of_state.rest_density / scales.speed_limit**2
-        ) * ti.max(LEAST_RESPONSE, f[26])
+        p.density[i] = f[DENSITY_RATIO] * rest_density
+        diagonal[i] = ti.static(fluid.rest_density / scales.speed_limit**2) * ti.max(
+            SMALLEST_DIAGONAL, f[RESPONSE]
+        )
         o = evaluate(network, f)
-        excess = largest_stiffness * sigmoid(o[0]) * (f[25] - 1.0)
-        excess -= largest_damping * sigmoid(o[1]) * f[24]
-        pressure_term[i] = ti.max(0.0, excess) / response[i]
+        excess = largest_stiffness * sigmoid(o[0]) * (f[DENSITY_RATIO] - 1.0)
+        excess -= largest_damping * sigmoid(o[1]) * f[DIVERGENCE]
+        pressure_term[i] = ti.max(0.0, excess) / diagonal[i]
         viscosity[i] = ti.min(thickest, eta * ti.exp(ti.min(o[2], LARGEST_EXPONENT)))

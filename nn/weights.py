@@ -10,11 +10,12 @@ import numpy as np
 
 from nn.features import NAMES, TABLE_VERSION, Inputs
 from taichi_sph.errors import InputError
-from taichi_sph.fluid.wcsph import Fluid
+from taichi_sph.fluid.model import Fluid
 from taichi_sph.system import replaced
 
-HEADS = ("direct", "pressure")
 SCHEMA = 3
+VISCOSITY_RATIO = "thickening"
+"""Name of `Training.viscosity_ratio` in a weights file."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class Training:
     """What the network was trained on.
 
     The network itself is dimensionless: it serves any scene of the same `support_ratio`,
-    `artificial_viscosity` and `thickening`, with the step that its `courant_number` gives there.
+    `artificial_viscosity` and `viscosity_ratio`, with the step that its `courant_number` gives
+    there.
     """
 
     head: str
@@ -38,13 +40,14 @@ class Training:
     substeps: int
     """M: steps of the physics in T."""
     rounds: int
-    """Rounds after the pressure head's guess, see taichi_sph.implicit; none of the direct head."""
+    """Jacobi iterations after the pressure head's initial pressure, see taichi_sph.fluid.implicit;
+    none of the direct head."""
     sound_speed: float
     """c of the physics that made the data [m/s]."""
     wall_spacing_ratio: float
     artificial_viscosity: float
     """Monaghan's alpha of the physics that made the data."""
-    thickening: float
+    viscosity_ratio: float
     """Viscosity at rest over that at high shear: 1 of a Newtonian liquid."""
     correction: str
     """"bp", "periodic" or "relabel"."""
@@ -79,7 +82,7 @@ def dimensionless_numbers(fluid: Fluid) -> dict[str, float]:
     """The numbers of a liquid that a network depends on; see `Training`."""
     return {
         "artificial_viscosity": fluid.artificial_viscosity,
-        "thickening": fluid.rheology.largest_viscosity / fluid.rheology.eta,
+        "viscosity_ratio": fluid.rheology.largest_viscosity / fluid.rheology.eta,
     }
 
 
@@ -113,12 +116,14 @@ class Weights:
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all."""
+        training = asdict(self.training)
+        training[VISCOSITY_RATIO] = training.pop("viscosity_ratio")
         arrays: dict[str, Any] = {
             "mean": self.mean,
             "deviation": self.deviation,
             "scale": self.scale,
             "schema": np.int64(SCHEMA),
-            "training": np.str_(json.dumps(asdict(self.training))),
+            "training": np.str_(json.dumps(training)),
         }
         for k, (w, b) in enumerate(self.layers):
             arrays[f"weight_{k}"], arrays[f"bias_{k}"] = w, b
@@ -142,6 +147,7 @@ class Weights:
                     )
                 facts = json.loads(str(file["training"]))
                 facts["inputs"] = tuple(facts["inputs"])
+                facts["viscosity_ratio"] = facts.pop(VISCOSITY_RATIO)
                 training = Training(**facts)
                 training.columns  # noqa: B018  names of this program's table, or ValueError
                 count = sum(name.startswith("weight_") for name in file.files)
@@ -193,6 +199,6 @@ def require_fit(weights: Weights, path: str, found: dict[str, float]) -> None:
             )
 
 
-TOLERANCE = {"support_ratio": 1e-3, "artificial_viscosity": 1e-3, "thickening": 0.5}
+TOLERANCE = {"support_ratio": 1e-3, "artificial_viscosity": 1e-3, "viscosity_ratio": 0.5}
 """Relative.  Yield stresses of blood differ by more between people than by half (Merrill: 2 to
 10 mPa), and hardly matter where it pours; a Newtonian liquid is refused where blood was learned."""

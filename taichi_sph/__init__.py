@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from taichi_sph.errors import InputError as InputError
     from taichi_sph.errors import RunError as RunError
-    from taichi_sph.fluid.wcsph import AccelerationModel as AccelerationModel
+    from taichi_sph.fluid.model import AccelerationModel as AccelerationModel
     from taichi_sph.models import implicit as implicit
     from taichi_sph.models import physics as physics
     from taichi_sph.runtime import float_dtype as float_dtype
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from taichi_sph.state import State as State
 
 _HOMES = {
-    "AccelerationModel": "fluid.wcsph",
+    "AccelerationModel": "fluid.model",
     "InputError": "errors",
     "RunError": "errors",
     "Scene": "scene",

@@ -28,8 +28,8 @@ from taichi_sph.derived import Derived, derive
 from taichi_sph.errors import InputError
 from taichi_sph.fluid.calibration import Calibration, calibrate
 from taichi_sph.fluid.equation_of_state import Tait
+from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import make_rheology
-from taichi_sph.fluid.wcsph import Fluid
 from taichi_sph.geometry.filling import clear_of_proxies
 from taichi_sph.geometry.findings import BEYOND
 from taichi_sph.geometry.mesh import Floats

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from taichi_sph.boundary.wall_motion import read_wall_motion
+from taichi_sph.fluid.model import stable_step_limits
 from taichi_sph.fluid.rheology import make_rheology
 from taichi_sph.geometry.vessel import Vessel
+from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.scene import Scene
 from taichi_sph.waveform import read_waveform
 
@@ -75,11 +77,10 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
     speed = expected_speed(scene, vessel)
     # Without gravity nothing drives the blood but itself: 1 m/s, an arterial speed, then.
     sound = grid.sound_speed_ratio * (speed or 1.0)
-    h = 0.5 * radius
-    viscosity = make_rheology(scene.blood.rheology).largest_viscosity
-    step = min(
-        grid.courant_number * h / (sound + speed), 0.125 * h * h * scene.blood.density / viscosity
-    )
+    limits = stable_step_limits(
+        WendlandC2(radius).smoothing_length, scene.blood.density,
+        make_rheology(scene.blood.rheology).largest_viscosity, sound, grid.courant_number, speed,
+    )  # fmt: skip
     narrowest = 2.0 * min((o.radius for o in vessel.openings), default=math.nan)
     return Derived(
         blood_particles=blood_count,
@@ -87,7 +88,7 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
         support_radius=radius,
         expected_speed=speed,
         sound_speed=sound,
-        step=step,
+        step=limits.smallest,
         reynolds_number=scene.blood.density * speed * narrowest / scene.blood.rheology.viscosity,
         particles_across_narrowest=narrowest / grid.spacing,
     )

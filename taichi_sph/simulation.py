@@ -17,7 +17,8 @@ from taichi_sph.boundary.wounds import Wounds
 from taichi_sph.derived import Derived
 from taichi_sph.diagnostics import Diagnostics, describe_divergence, diagnose
 from taichi_sph.errors import InputError, RunError
-from taichi_sph.fluid.wcsph import AccelerationModel, Fluid, SphAcceleration
+from taichi_sph.fluid.model import AccelerationModel, Fluid
+from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.integrator import kick_drift, largest_speed_and_acceleration
 from taichi_sph.runtime import finish_fields, require_runtime, runtime_number

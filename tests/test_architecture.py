@@ -60,7 +60,7 @@ WITHOUT_TAICHI = ("taichi_sph.errors", "taichi_sph.system", "taichi_sph.scene",
 
 ONLY_IN = {
     "rerun": ("app.view.rerun_view", "app.view.rerun_streams"),
-    "torch": ("nn.training.train",),
+    "torch": ("nn.training.torch_network", "nn.training.train"),
     "click": ("app.cli",),
     "viser": ("app.control.page",),
 }

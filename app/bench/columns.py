@@ -116,6 +116,8 @@ def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, so
     """SPlisHSPlasH's WCSPH with a like column in a like tank; returns (step, blood, proxies)."""
     import trimesh
 
+    from taichi_sph.fluid.equation_of_state import Tait
+
     d = 1e-3
     # Its first layer stands one spacing off the wall, ours half of one.
     size = np.array([across + 1, across + 1, height]) * d
@@ -131,7 +133,10 @@ def _start_peer(folder: Path, across: int, height: int, fill: int, dt: float, so
             "gravitation": [0, 0, -9.81],
             "cflMethod": 0,
             "timeStepSize": dt,
-            "WCSPH": {"stiffness": 1060.0 * sound**2 / 7.0, "exponent": 7},
+            "WCSPH": {
+                "stiffness": Tait(1060.0, sound).stiffness,
+                "exponent": Tait.exponent,
+            },
             "boundaryHandlingMethod": 0,
             "enableZSort": True,
         },

@@ -150,22 +150,26 @@ def measure_passes(
     simulation.advance_to(0.05)
     net = simulation.model
     assert isinstance(net, PressurePcNet)
+    implicit = net.implicit
     full = Weights.load(weights)
     flat = np.zeros((3, full.sizes[0]), np.float32), np.zeros(3, np.float32)
     p, w, nb = simulation.particles, simulation.wall, simulation.neighbors
-    fluid, scratch = net.physics.fluid, (net.physics.pressure_term, net.physics.viscosity)
+    fluid = replace(simulation.fluid, nested=False)
+    scratch = implicit.pressure_term, implicit.viscosity
     shallow = PressurePcNet(replace(full, layers=(flat,)), fluid, net.scales, p.capacity)
-    gravity, stress = scene.gravity, net.physics.stress
+    gravity, stress = scene.gravity, implicit.stress
     numbers, sums = ti.field(float, 1 << 20), ti.field(float, max(p.capacity, (1 << 20) // RUN))
     seconds = _median({
         "neighbour search": lambda: nb.build(p, w),
         "physics: density, shear rate": lambda: sum_density(p, w, nb, fluid, *scratch),
         "physics: forces": lambda: sum_acceleration(p, w, nb, fluid, *scratch, stress, *gravity),
-        "PcNet: features and network": lambda: net.guess(p, w, nb),
-        "PcNet: features, no hidden layer": lambda: shallow.guess(p, w, nb),
-        "PcNet: forces": lambda: sum_acceleration(p, w, nb, net.fluid, *scratch, stress, *gravity),
+        "PcNet: features and network": lambda: net.estimate(p, w, nb, implicit),
+        "PcNet: features, no hidden layer": lambda: shallow.estimate(p, w, nb, shallow.implicit),
+        "PcNet: forces": lambda: sum_acceleration(
+            p, w, nb, implicit.fluid, *scratch, stress, *gravity
+        ),
         "PcNet: correction": lambda: correct_pressure(
-            p, w, nb, net.fluid, net.interval, net.response, net.physics.pressure_term
+            p, w, nb, implicit.fluid, implicit.interval, implicit.diagonal, implicit.pressure_term
         ),
         "survey": lambda: largest_speed_and_acceleration(p),
         "integration, wall": lambda: kick_drift(p, w, nb, None, False, 0.0),

@@ -121,7 +121,7 @@ def train(
     from app.training import train as learn
 
     learn.require_torch("train")
-    from nn.training.train import Settings
+    from nn.training.runs import Settings
 
     settings = Settings(**given)
     command = (

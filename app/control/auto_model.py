@@ -11,7 +11,7 @@ from taichi_sph.errors import InputError
 
 if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics
-    from taichi_sph.fluid.wcsph import AccelerationModel
+    from taichi_sph.fluid.model import AccelerationModel
     from taichi_sph.simulation import Simulation
 
 AUTO = "auto"

@@ -14,7 +14,7 @@ from app.models import MODELS, model_factory
 from app.studies.splishsplash import SOLVERS, Peer
 from nn.weights import Weights
 from taichi_sph.fluid.implicit import implicit_factory
-from taichi_sph.fluid.wcsph import AccelerationModel, Fluid
+from taichi_sph.fluid.model import AccelerationModel, Fluid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall
@@ -128,7 +128,7 @@ class Method:
         if self.model == "ballistic":
             own: ModelFactory = Ballistic
         elif self.model == "implicit" and self.rounds is not None:
-            own = implicit_factory(scene, rounds=self.rounds)
+            own = implicit_factory(scene, iterations=self.rounds)
         else:
             own = model_factory(self.model, scene, self.weights, self.guarded)
         factor = self.step_factor or 1.0
@@ -181,11 +181,11 @@ class Ballistic:
         gravity: tuple[float, float, float],
     ) -> None:
         """a_i = g."""
-        fall(particles, ti.Vector(gravity), self.fluid.equation_of_state.rest_density)
+        fall(particles, ti.Vector(gravity), self.fluid.rest_density)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """A fifth of the support radius at the largest speed, or at a hundredth of sound's [s]."""
-        slowest = 0.01 * self.fluid.equation_of_state.sound_speed
+        slowest = 0.01 * self.fluid.sound_speed
         return 0.2 * self.fluid.kernel.support_radius / max(largest_speed, slowest)
 
 

@@ -25,6 +25,7 @@ from taichi_sph.assemble import OPENING_REACH, SKIN
 from taichi_sph.derived import derive
 from taichi_sph.diagnostics import Diagnostics, diagnose
 from taichi_sph.errors import InputError, RunError
+from taichi_sph.fluid.equation_of_state import Tait
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.vessel import Vessel, read_vessel
 from taichi_sph.scene import Scene
@@ -206,6 +207,7 @@ class Peer:
         # which are half of them; without any the blood clumps.
         artificial = 0.05 * scene.blood.artificial_viscosity * self.derived.sound_speed * d
         g = math.hypot(*scene.gravity)
+        law = Tait(scene.blood.density, self.derived.sound_speed)
         return {
             "Configuration": {
                 "particleRadius": 0.5 * d,
@@ -218,8 +220,8 @@ class Peer:
                 "cflMinTimeStepSize": 1e-8,
                 "cflMaxTimeStepSize": 0.25 * math.sqrt(d / g) if g else scene.frame_interval,
                 "WCSPH": {
-                    "stiffness": scene.blood.density * self.derived.sound_speed**2 / 7.0,
-                    "exponent": 7.0,
+                    "stiffness": law.stiffness,
+                    "exponent": float(law.exponent),
                 },
             },
             "Materials": [

@@ -19,8 +19,10 @@ from app.files import console, table, write_json
 from app.jobs.process import report
 from app.jobs.study import run_study
 from nn.dataset.reader import Dataset
-from nn.features import COUNT, NAMES
-from nn.training.train import Settings, TrainingRuns, train_weights, use_threads
+from nn.features import NAMES, PAPER_COUNT
+from nn.training.runs import Settings, TrainingRuns
+from nn.training.torch_network import use_threads
+from nn.training.train import train_weights
 from nn.weights import CLIP, Weights
 from taichi_sph.errors import InputError
 
@@ -44,8 +46,8 @@ def linear(
     wide = 1e6 / CLIP  # nothing is clipped
     return Weights(
         ((matrix.astype(np.float32), (offset / wide).astype(np.float32)),),
-        np.zeros(COUNT, np.float32),
-        np.full(COUNT, wide, np.float32),
+        np.zeros(PAPER_COUNT, np.float32),
+        np.full(PAPER_COUNT, wide, np.float32),
         np.full(3, wide, np.float32),
         course.training(settings, ""),
     )
@@ -53,17 +55,19 @@ def linear(
 
 def persistence(course: TrainingRuns, settings: Settings) -> Weights:
     """a_i^{n+1} = a_i^n."""
-    return linear(course, settings, np.eye(3, COUNT), np.zeros(3))
+    return linear(course, settings, np.eye(3, PAPER_COUNT), np.zeros(3))
 
 
 def ridge(course: TrainingRuns, settings: Settings) -> Weights:
     """Ridge regression of the target on the 23 features, by their own deviations."""
     features, target = course.examples(32)
-    x = features[:, :COUNT].astype(np.float64)
+    x = features[:, :PAPER_COUNT].astype(np.float64)
     mean, deviation = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
     z = (x - mean) / deviation
     y = target / course.scales.acceleration
-    weight = np.linalg.solve(z.T @ z + 1e-3 * len(z) * np.eye(COUNT), z.T @ (y - y.mean(axis=0)))
+    weight = np.linalg.solve(
+        z.T @ z + 1e-3 * len(z) * np.eye(PAPER_COUNT), z.T @ (y - y.mean(axis=0))
+    )
     matrix = (weight / deviation[:, None]).T
     return linear(course, settings, matrix, y.mean(axis=0) - matrix @ mean)
 

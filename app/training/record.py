@@ -31,7 +31,7 @@ from nn.dataset.schema import (
     size_of,
 )
 from nn.dataset.writer import RunWriter, committed_states, merge
-from nn.features import COUNT, TABLE_VERSION, FeatureScales
+from nn.features import PAPER_COUNT, TABLE_VERSION, FeatureScales
 from nn.training.rollout import ReplaySimulation
 from taichi_sph.derived import derive
 from taichi_sph.errors import InputError, RunError
@@ -234,7 +234,7 @@ def plan(
 
 
 def _feature_count(metadata: RunMetadata) -> int:
-    return COUNT if metadata.feature_version else 0
+    return PAPER_COUNT if metadata.feature_version else 0
 
 
 def _require_recorded(out: Path, runs: Sequence[RunMetadata]) -> None:
@@ -309,7 +309,7 @@ def record_run(job: RecordingJob) -> None:
             found = None
             if metadata.feature_version and frame < metadata.frames:
                 replay.set_acceleration(acceleration)
-                found = replay.features(scales)[:, :COUNT]
+                found = replay.features(scales)[:, :PAPER_COUNT]
             writer.append(now, acceleration, found, replay.substeps())
             before = now
             report((frame + 1 - there) / (metadata.frames + 1 - there))

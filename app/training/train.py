@@ -11,7 +11,8 @@ from app.progress import duration
 from taichi_sph.errors import InputError
 
 if TYPE_CHECKING:
-    from nn.training.train import Progress, Settings
+    from nn.training.runs import Settings
+    from nn.training.train import Progress
 
 
 def require_torch(command: str) -> None:
@@ -49,7 +50,9 @@ def train(
     check_output(curves, "--out", b"{")
 
     from nn.dataset.reader import Dataset
-    from nn.training.train import TrainingRuns, train_weights, use_threads
+    from nn.training.runs import TrainingRuns
+    from nn.training.torch_network import use_threads
+    from nn.training.train import train_weights
     from taichi_sph.runtime import start
 
     use_threads(threads)

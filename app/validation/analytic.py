@@ -12,6 +12,8 @@ from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
 from scipy.special import j0, j1, jn_zeros, jv
 
+from taichi_sph.fluid.equation_of_state import Tait
+
 BESSEL_TERMS = 200
 """Terms of the start-up series; the first one left out is below 1e-6 of the steady speed."""
 
@@ -175,7 +177,11 @@ def generalised_pipe(
 
 
 def hydrostatic_density(
-    depth: np.ndarray, gravity: float, rest_density: float, sound_speed: float, gamma: float = 7.0
+    depth: np.ndarray,
+    gravity: float,
+    rest_density: float,
+    sound_speed: float,
+    gamma: float = Tait.exponent,
 ) -> np.ndarray:
     """Density at a depth below the surface of a liquid at rest that obeys Tait's law [kg/m^3].
 
@@ -189,7 +195,11 @@ def hydrostatic_density(
 
 
 def hydrostatic_pressure(
-    depth: np.ndarray, gravity: float, rest_density: float, sound_speed: float, gamma: float = 7.0
+    depth: np.ndarray,
+    gravity: float,
+    rest_density: float,
+    sound_speed: float,
+    gamma: float = Tait.exponent,
 ) -> np.ndarray:
     """Pressure at a depth below the surface of the same [Pa]; rho_0 g z to first order."""
     ratio = hydrostatic_density(depth, gravity, rest_density, sound_speed, gamma) / rest_density
@@ -197,7 +207,11 @@ def hydrostatic_pressure(
 
 
 def hydrostatic_height(
-    fill: float, gravity: float, rest_density: float, sound_speed: float, gamma: float = 7.0
+    fill: float,
+    gravity: float,
+    rest_density: float,
+    sound_speed: float,
+    gamma: float = Tait.exponent,
 ) -> float:
     """Height to which a column that filled `fill` [m] at rest density sinks by its weight [m].
 

@@ -14,8 +14,9 @@ import numpy as np
 from taichi_sph.boundary.boundary import BloodFlow
 from taichi_sph.fluid.calibration import calibrate
 from taichi_sph.fluid.equation_of_state import Tait
+from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import Casson, Newtonian
-from taichi_sph.fluid.wcsph import Fluid, SphAcceleration
+from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.particles.grid import make_grid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
@@ -104,13 +105,6 @@ def state_of(simulation: Simulation) -> State:
     """The state that the fields hold."""
     p = simulation.particles
     return State(*(p.in_order(f).astype(float) for f in (p.position, p.velocity, p.density)))
-
-
-def pressure_of(density: np.ndarray, equation_of_state: Tait) -> np.ndarray:
-    """Tait's pressure [Pa] in double precision, bounded below as the simulation bounds it."""
-    ratio = density / equation_of_state.rest_density
-    p = equation_of_state.stiffness * (ratio**equation_of_state.gamma - 1.0)
-    return np.maximum(0.0, p + equation_of_state.background_pressure)
 
 
 def make_simulation(

@@ -84,7 +84,7 @@ def hydrostatic(report: Report, quick: bool) -> None:
     state = state_of(motion)
     height = analytic.hydrostatic_height(fill, GRAVITY, DENSITY, c)
     z = state.position[:, 2]
-    pressure = flows.pressure_of(state.density, liquid.fluid().equation_of_state)
+    pressure = liquid.fluid().equation_of_state.pressure_of(state.density)
     theory = analytic.hydrostatic_pressure(height - z, GRAVITY, DENSITY, c)
     report.add(
         f"hydrostatic column {layers} d high: pressure, L2 over particles",

@@ -1,12 +1,16 @@
 """Replay: a simulation that can be put into a recorded state and driven by either model."""
 
+from dataclasses import replace
+
 import numpy as np
 import taichi as ti
 
 from nn.dataset.schema import RecordedState, Substeps
-from nn.features import GATHERED, FeatureScales, extract
+from nn.features import ROW_COUNT, FeatureScales, extract
 from taichi_sph.errors import InputError
-from taichi_sph.fluid.wcsph import Fluid, SphAcceleration, sum_density
+from taichi_sph.fluid.model import Fluid
+from taichi_sph.fluid.rheology import Newtonian
+from taichi_sph.fluid.wcsph import SphAcceleration, sum_acceleration, sum_density
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
@@ -40,7 +44,9 @@ class ReplaySimulation:
         """Constants of the physics."""
         self.use_physics()
         self._step_lengths: list[float] = []
-        self._features = ti.ndarray(float, (self.simulation.particles.capacity, GATHERED))
+        self._zero: ti.Field | None = None
+        """Neither pressure nor viscosity, for `other_acceleration`."""
+        self._features = ti.ndarray(float, (self.simulation.particles.capacity, ROW_COUNT))
 
     def use_physics(self) -> None:
         """Let the physics drive, with no step longer than the scene's own."""
@@ -97,13 +103,34 @@ class ReplaySimulation:
         particles.acceleration.from_numpy(rows)
 
     def viscosity(self) -> np.ndarray:
-        """The physics' viscosity of the blood as it stands [Pa s], a row a particle."""
+        """The physics' viscosity of the blood as it stands [Pa s], a row a particle.
+
+        It leaves the densities of the blood as it stands.
+        """
         blood, own = self.simulation.blood, self.physics
         sum_density(
             blood.particles, blood.wall, blood.neighbors, own.fluid, own.pressure_term,
             own.viscosity,
         )  # fmt: skip
         return own.viscosity.to_numpy()[: blood.particles.count[None]]
+
+    def other_acceleration(self) -> np.ndarray:
+        """Accelerations by all but pressure, viscosity and gravity [m/s^2], a row a particle.
+
+        What `sum_acceleration` gives where both are zero, of the densities that `viscosity` leaves.
+        """
+        blood, n = self.simulation.blood, self.simulation.particles.count[None]
+        if self._zero is None:
+            self._zero = ti.field(float, blood.particles.capacity)
+        previous = blood.particles.acceleration.to_numpy()
+        inviscid = replace(self.fluid, rheology=Newtonian(0.0), nested=False)
+        sum_acceleration(
+            blood.particles, blood.wall, blood.neighbors, inviscid, self._zero, self._zero,
+            self.physics.stress, 0.0, 0.0, 0.0,
+        )  # fmt: skip
+        other = blood.particles.acceleration.to_numpy()[:n]
+        blood.particles.acceleration.from_numpy(previous)
+        return other
 
     def features(self, scales: FeatureScales) -> np.ndarray:
         """What `nn.features.features_of` gives for the state as it stands, a row a particle."""

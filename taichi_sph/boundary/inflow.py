@@ -37,7 +37,7 @@ from scipy.spatial import cKDTree
 
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.errors import InputError, RunError
-from taichi_sph.fluid.wcsph import AccelerationModel
+from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.geometry.mesh import Floats, Integers
 from taichi_sph.geometry.openings import Opening
 from taichi_sph.runtime import float_dtype, has_wide_atomics

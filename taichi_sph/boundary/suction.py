@@ -7,7 +7,7 @@ import taichi as ti
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.boundary.outlets import SUCTION, Outlets
 from taichi_sph.boundary.tool import Tool
-from taichi_sph.fluid.wcsph import AccelerationModel
+from taichi_sph.fluid.model import AccelerationModel
 
 
 class Suction(Boundary):

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.boundary.tool_surface import ToolSurface
-from taichi_sph.fluid.wcsph import AccelerationModel, force_on_tool
+from taichi_sph.fluid.model import AccelerationModel
+from taichi_sph.fluid.wcsph import force_on_tool
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.particles.wall import place_tool
 from taichi_sph.runtime import float_dtype

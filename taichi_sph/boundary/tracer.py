@@ -14,7 +14,7 @@ import taichi as ti
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.boundary.inflow import BufferZones
 from taichi_sph.errors import InputError
-from taichi_sph.fluid.wcsph import AccelerationModel
+from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.particles.particles import Quantity
 from taichi_sph.runtime import float_dtype

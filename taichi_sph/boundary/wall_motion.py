@@ -14,7 +14,7 @@ import numpy as np
 
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.errors import InputError
-from taichi_sph.fluid.wcsph import AccelerationModel
+from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.particles.wall import move_wall

@@ -1,14 +1,15 @@
-"""Pressure from density."""
+"""Pressure from density: the law in Taichi, for the sums, and in numpy beside it."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import taichi as ti
 
 
 @ti.data_oriented
 @dataclass(frozen=True)
 class Tait:
-    """Tait's equation, Eq. 14: p = rho_0 c^2 / 7 ((rho/rho_0)^7 - 1), never below zero.
+    """Tait's equation, Eq. 14: p = rho_0 c^2/gamma ((rho/rho_0)^gamma - 1), never below zero.
 
     Without the bound a free surface, whose density sum lacks neighbours, would pull particles
     together and onto walls.  A flow that fills its vessel has no free surface; a background
@@ -22,18 +23,24 @@ class Tait:
     background_pressure: float = 0.0
     """Pressure at rest density [Pa]."""
 
-    gamma = 7
-    """Exponent; Cole (1948), as the paper."""
+    exponent = 7
+    """Exponent gamma: Cole (1948), as the paper; a whole number."""
 
     @property
     def stiffness(self) -> float:
-        """rho_0 c^2 / gamma [Pa]."""
-        return self.rest_density * self.sound_speed**2 / self.gamma
+        """Stiffness rho_0 c^2/gamma [Pa]."""
+        return self.rest_density * self.sound_speed**2 / self.exponent
 
     @ti.func
     def pressure(self, density):
         """Pressure p [Pa]."""
-        c = density * ti.static(1.0 / self.rest_density)
-        c2 = c * c
-        c6 = c2 * c2 * c2
-        return ti.max(0.0, self.stiffness * (c6 * c - 1.0) + self.background_pressure)
+        ratio = density * ti.static(1.0 / self.rest_density)
+        return ti.max(
+            0.0,
+            self.stiffness * (ratio ** ti.static(self.exponent) - 1.0) + self.background_pressure,
+        )
+
+    def pressure_of(self, density: np.ndarray) -> np.ndarray:
+        """Pressure p [Pa] for numpy, double precision, shape of `density`."""
+        power = (np.asarray(density, dtype=float) / self.rest_density) ** self.exponent
+        return np.maximum(0.0, self.stiffness * (power - 1.0) + self.background_pressure)

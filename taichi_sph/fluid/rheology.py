@@ -38,7 +38,7 @@ class Casson:
 
     The paper prints exp(-n g), with which blood at rest is as thin as at high shear; the square
     root gives the finite plateau (sqrt(eta) + sqrt(n tau_y))^2 (Papanastasiou 1987,
-    doi:10.1122/1.549926, applied to Casson's law).  `printed` selects the paper's form.
+    doi:10.1122/1.549926, applied to Casson's law).  `as_printed` selects the paper's form.
     """
 
     eta: float
@@ -47,7 +47,7 @@ class Casson:
     """Yield stress [Pa]."""
     n: float
     """Time of the regulariser [s]."""
-    printed: bool = False
+    as_printed: bool = False
     """The exponent as the paper prints it."""
 
     shear_dependent = True
@@ -63,7 +63,7 @@ class Casson:
         # Below 1e-12 1/s the quotient's limit is reached to 1e-5; 0/0 must not appear.
         g = ti.max(shear_rate, 1e-12)
         exponent = self.n * g
-        if ti.static(not self.printed):
+        if ti.static(not self.as_printed):
             exponent = ti.sqrt(exponent)
         # 1 - exp(-x) = 2 exp(-x/2) sinh(x/2) loses digits for small x: three terms of its series.
         rise = 1.0 - ti.exp(-exponent)
@@ -74,6 +74,18 @@ class Casson:
 
 
 Rheology = Newtonian | Casson
+
+
+@ti.func
+def shear_rate(gradient):
+    """Shear rate sqrt(2 D:D) [1/s], D the symmetric, traceless part of a velocity gradient."""
+    g = gradient + gradient.transpose()
+    third = g.trace() / 3.0
+    square = 0.0
+    for a, b in ti.static(ti.ndrange(3, 3)):
+        entry = g[a, b] - (third if ti.static(a == b) else 0.0)
+        square += entry * entry
+    return ti.sqrt(0.5 * square)
 
 
 def make_rheology(table: NewtonianTable | CassonTable) -> Rheology:

@@ -18,8 +18,9 @@ from reference import Blood
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.fluid.calibration import Calibration, calibrate
 from taichi_sph.fluid.equation_of_state import Tait
+from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import Newtonian
-from taichi_sph.fluid.wcsph import Fluid, SphAcceleration
+from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.particles.grid import make_grid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles

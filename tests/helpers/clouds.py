@@ -14,7 +14,7 @@ from builders import (
     make_fluid,
     sphere,
 )
-from nn.features import GATHERED, FeatureScales, extract
+from nn.features import ROW_COUNT, FeatureScales, extract
 
 SCALES = FeatureScales(R, D, 4e-4, 2.0, WALL_SPACING / D)
 FLUID = make_fluid()
@@ -37,6 +37,6 @@ def cloud(seed: int) -> Setup:
 
 def extracted(stage: Setup) -> np.ndarray:
     """What the kernel finds, by identity, (n, 27)."""
-    out = ndarray(float, (stage.particles.capacity, GATHERED))
+    out = ndarray(float, (stage.particles.capacity, ROW_COUNT))
     extract(stage.particles, stage.wall, stage.neighbors, FLUID, SCALES, out)
     return out.to_numpy()[: stage.particles.count[None]]

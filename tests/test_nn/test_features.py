@@ -12,7 +12,16 @@ from builders import (
     sphere,
 )
 from clouds import FLUID, SCALES, cloud, extracted
-from nn.features import BINS, COUNT, EXTENDED, NAMES, FeatureScales
+from nn.features import (
+    BINS,
+    COMPRESSION,
+    DENSITY_RATIO,
+    DIVERGENCE,
+    NAMES,
+    PAPER_COUNT,
+    RESPONSE,
+    FeatureScales,
+)
 
 CLOSE = {"f64": 1e-10, "f32": 1e-5}
 """Of each feature's largest value; single precision has seven digits."""
@@ -37,7 +46,7 @@ def shape(values: np.ndarray) -> tuple[float, float]:
 
 def features_of(x, v, a, y) -> tuple[np.ndarray, np.ndarray]:
     """Features by brute force, (n, 23), and whether rounding could change a bin, (n,)."""
-    rows, doubtful = np.zeros((len(x), COUNT)), np.zeros(len(x), bool)
+    rows, doubtful = np.zeros((len(x), PAPER_COUNT)), np.zeros(len(x), bool)
     for i in range(len(x)):
         f = rows[i]
         f[0:3] = a[i] / SCALES.acceleration
@@ -72,9 +81,9 @@ def test_features_are_the_papers_statistics(seed):
     x, v, a = map(stage.in_order, (particles.position, particles.velocity, particles.acceleration))
     y = stage.wall.position.to_numpy()[: stage.wall.count].astype(float)
     expected, doubtful = features_of(x, v, a, y)
-    found = extracted(stage)[:, :COUNT]
+    found = extracted(stage)[:, :PAPER_COUNT]
     assert doubtful.mean() < 0.2
-    for k, name in enumerate(NAMES[:COUNT]):
+    for k, name in enumerate(NAMES[:PAPER_COUNT]):
         largest = np.abs(expected[:, k]).max()
         assert largest > 0.0, name
         difference = np.abs(found[:, k] - expected[:, k])[~doubtful].max()
@@ -85,16 +94,16 @@ def test_density_beside_the_features_is_equation_2():
     stage = cloud(2)
     density = stage.reference(FLUID).rho / DENSITY
     found = extracted(stage)
-    np.testing.assert_allclose(found[:, EXTENDED], density, rtol=CLOSE[precision()])
+    np.testing.assert_allclose(found[:, DENSITY_RATIO], density, rtol=CLOSE[precision()])
     np.testing.assert_allclose(
-        found[:, COUNT], 50.0 * np.maximum(density - 1.0, 0.0), atol=5e3 * CLOSE[precision()]
+        found[:, COMPRESSION], 50.0 * np.maximum(density - 1.0, 0.0), atol=5e3 * CLOSE[precision()]
     )
 
 
 def test_response_is_what_a_particles_own_pressure_does_to_its_density():
     stage = cloud(4)
     fluid = stage.reference(FLUID)
-    found = extracted(stage)[:, EXTENDED + 1]
+    found = extracted(stage)[:, RESPONSE]
     blood = fluid.spacing_volume * fluid.grad
     wall = FLUID.calibration.wall_density * fluid.volume[:, None] * fluid.grad_wall
     whole = blood.sum(axis=1) + wall.sum(axis=1)
@@ -131,7 +140,7 @@ def test_divergence_is_the_rate_at_which_density_falls():
     rate = (densities[0] - densities[1]) / (2.0 * dt)
     assert np.abs(a).max() > 0.0
     scale = np.abs(rate).max()
-    error = np.abs(before[:, COUNT + 1] / SCALES.frame_interval + rate).max()
+    error = np.abs(before[:, DIVERGENCE] / SCALES.frame_interval + rate).max()
     # The difference's own rounding in f32: 1e-7 over 2e-6 s.
     assert error < {"f64": 1e-4 * scale, "f32": 0.2 + 1e-2 * scale}[precision()]
 
@@ -142,4 +151,4 @@ def test_a_lone_particle_has_finite_features_and_no_neighbours():
     stage.build()
     found = extracted(stage)[0]
     assert np.isfinite(found).all()
-    assert np.all(found[:COUNT] == 0.0)
+    assert np.all(found[:PAPER_COUNT] == 0.0)

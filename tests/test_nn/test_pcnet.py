@@ -11,12 +11,12 @@ import pytest
 
 from builders import DENSITY, D, R, jittered_lattice, make_fluid, periodic, precision
 from clouds import SCALES, cloud, extracted
-from nn.features import COUNT, EXTENDED, NAMES
-from nn.pcnet import DirectPcNet, largest_factors, make_pcnet
+from nn.features import DENSITY_RATIO, DIVERGENCE, NAMES, NETWORK_COUNT, PAPER_COUNT, RESPONSE
+from nn.pcnet import DirectPcNet, PressurePcNet, largest_factors, make_pcnet
 from nn.weights import Training, Weights, require_fit
 from places import ROOT
 from taichi_sph.errors import InputError
-from taichi_sph.fluid.implicit import LARGEST_ADVANCE, LARGEST_VISCOSITY, LEAST_RESPONSE
+from taichi_sph.fluid.implicit import LARGEST_ADVECTIVE_CFL, LARGEST_VISCOSITY, SMALLEST_DIAGONAL
 from taichi_sph.fluid.rheology import Newtonian
 
 CLOSE = {"f64": 1e-6, "f32": 1e-5}
@@ -28,7 +28,7 @@ FLUID = make_fluid()
 def weights(head: str, seed: int = 0) -> Weights:
     """A random network of the paper's size."""
     generator = np.random.default_rng(seed)
-    sizes = (COUNT, 5, 5, 5, 3) if head == "direct" else (EXTENDED, 5, 5, 5, 3)
+    sizes = (PAPER_COUNT, 5, 5, 5, 3) if head == "direct" else (NETWORK_COUNT, 5, 5, 5, 3)
     layers = tuple(
         (
             generator.normal(size=(b, a)).astype(np.float32) / np.float32(np.sqrt(a)),
@@ -47,7 +47,7 @@ def weights(head: str, seed: int = 0) -> Weights:
         sound_speed=SCALES.sound_speed,
         wall_spacing_ratio=1.0,
         artificial_viscosity=0.05,
-        thickening=17.3,
+        viscosity_ratio=17.3,
         correction="bp",
         seed=0,
         scene="tube",
@@ -71,7 +71,7 @@ def test_the_direct_head_is_the_network_of_the_features():
     stage = cloud(5)
     w = weights("direct")
     f = extracted(stage)
-    expected = w.evaluate(f[:, :COUNT]) * SCALES.acceleration
+    expected = w.evaluate(f[:, :PAPER_COUNT]) * SCALES.acceleration
     net = DirectPcNet(w, FLUID, SCALES, stage.particles.capacity)
     net.guarded = False
     net.accelerate(stage.particles, stage.wall, stage.neighbors, GRAVITY)
@@ -83,24 +83,26 @@ def test_the_pressure_head_gives_numbers_that_are_not_negative():
     stage = cloud(6)
     w = weights("pressure")
     f = extracted(stage)
-    o = w.evaluate(f[:, :EXTENDED])
+    o = w.evaluate(f[:, :NETWORK_COUNT])
     # So thick that half of the viscosities meet their bound.
     bound = LARGEST_VISCOSITY * DENSITY * R**2 / SCALES.frame_interval
     fluid = make_fluid(rheology=Newtonian(float(bound / np.exp(np.median(o[:, 2])))))
-    net = make_pcnet(w, fluid, SCALES, stage.particles.capacity)
+    net = PressurePcNet(w, fluid, SCALES, stage.particles.capacity)
     net.accelerate(stage.particles, stage.wall, stage.neighbors, GRAVITY)
     speed = R / SCALES.frame_interval
     density = FLUID.equation_of_state.rest_density
     stiffness, damping = largest_factors(0)
-    excess = stiffness * sigmoid(o[:, 0]) * (f[:, 25] - 1.0)
-    excess -= damping * sigmoid(o[:, 1]) * f[:, 24]
-    pressure = speed**2 / density * np.maximum(excess, 0.0) / np.maximum(f[:, 26], LEAST_RESPONSE)
+    excess = stiffness * sigmoid(o[:, 0]) * (f[:, DENSITY_RATIO] - 1.0)
+    excess -= damping * sigmoid(o[:, 1]) * f[:, DIVERGENCE]
+    pressure = (
+        speed**2 / density * np.maximum(excess, 0.0) / np.maximum(f[:, RESPONSE], SMALLEST_DIAGONAL)
+    )
     assert 0.1 < np.mean(pressure > 0.0) < 0.9
     viscosity = np.minimum(fluid.rheology.eta * np.exp(o[:, 2]), bound)
     assert 0.1 < np.mean(viscosity < bound) < 0.9
     for field, expected in (
-        (net.physics.pressure_term, pressure),
-        (net.physics.viscosity, viscosity),
+        (net.implicit.pressure_term, pressure),
+        (net.implicit.viscosity, viscosity),
     ):
         found = stage.in_order(field)
         assert found.min() >= 0.0
@@ -126,7 +128,7 @@ def test_the_step_shortens_for_blood_faster_than_any_in_training():
     net = make_pcnet(weights("pressure"), FLUID, SCALES, 8)
     assert net.stable_step(0.1 * SCALES.speed_limit, 1e9) == SCALES.frame_interval
     fast = 4.0 * SCALES.speed_limit
-    assert net.stable_step(fast, 1e9) * fast == pytest.approx(LARGEST_ADVANCE * R, rel=1e-12)
+    assert net.stable_step(fast, 1e9) * fast == pytest.approx(LARGEST_ADVECTIVE_CFL * R, rel=1e-12)
 
 
 def test_the_physics_takes_over_from_a_direct_head_that_lets_blood_collapse():
@@ -156,7 +158,7 @@ def test_the_network_is_the_one_that_torch_trains():
         "torch", reason="torch is an extra: pip install 'vesselflow[train]'"
     )
     w = weights("direct", seed=3)
-    x = np.random.default_rng(1).normal(size=(50, COUNT)).astype(np.float32)
+    x = np.random.default_rng(1).normal(size=(50, PAPER_COUNT)).astype(np.float32)
     y = ((torch.from_numpy(x) - torch.from_numpy(w.mean)) / torch.from_numpy(w.deviation)).clamp(
         -5, 5
     )
@@ -171,8 +173,8 @@ def test_weights_survive_the_file(tmp_path):
     w.save(tmp_path / "w.npz")
     again = Weights.load(tmp_path / "w.npz")
     assert again.training == w.training
-    assert again.sizes == (EXTENDED, 5, 5, 5, 3)
-    x = np.random.default_rng(0).normal(size=(9, EXTENDED)).astype(np.float32)
+    assert again.sizes == (NETWORK_COUNT, 5, 5, 5, 3)
+    x = np.random.default_rng(0).normal(size=(9, NETWORK_COUNT)).astype(np.float32)
     np.testing.assert_array_equal(again.evaluate(x), w.evaluate(x))
 
 
@@ -197,9 +199,9 @@ def test_weights_for_another_scene_name_the_field_and_both_values():
     w = weights("direct")
     require_fit(w, "w.npz", {"support_ratio": R / D})
     with pytest.raises(
-        InputError, match=r"^w.npz: thickening is 17.3 in the weights, 1 in the scene"
+        InputError, match=r"^w.npz: viscosity_ratio is 17.3 in the weights, 1 in the scene"
     ):
-        require_fit(w, "w.npz", {"support_ratio": R / D, "thickening": 1.0})
+        require_fit(w, "w.npz", {"support_ratio": R / D, "viscosity_ratio": 1.0})
 
 
 def run(*options: str) -> subprocess.CompletedProcess[str]:

@@ -13,18 +13,12 @@ from app.scenes.library import find_scene  # noqa: E402
 from app.training.compare_networks import persistence, ridge  # noqa: E402
 from builders import vesselflow  # noqa: E402
 from nn.dataset.reader import Dataset  # noqa: E402
-from nn.features import COUNT, FeatureScales  # noqa: E402
+from nn.features import PAPER_COUNT, FeatureScales  # noqa: E402
 from nn.pcnet import DirectPcNet, make_pcnet  # noqa: E402
 from nn.training.rollout import ReplaySimulation  # noqa: E402
-from nn.training.train import (  # noqa: E402
-    INPUTS,
-    Model,
-    Progress,
-    Settings,
-    TrainingRuns,
-    TrainingSample,
-    train_weights,
-)
+from nn.training.runs import INPUTS, Settings, TrainingRuns  # noqa: E402
+from nn.training.torch_network import TorchNetwork, TrainingSample  # noqa: E402
+from nn.training.train import Progress, train_weights  # noqa: E402
 from nn.weights import Training, Weights  # noqa: E402
 from taichi_sph.errors import InputError  # noqa: E402
 from taichi_sph.geometry.vessel import read_vessel  # noqa: E402
@@ -74,7 +68,9 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     )
     torch.manual_seed(1)
     features = stage.features(scales)[:, training.columns.index]
-    model = Model(training, features.mean(axis=0), np.maximum(features.std(axis=0), 1e-2), 0.7)
+    model = TorchNetwork(
+        training, features.mean(axis=0), np.maximum(features.std(axis=0), 1e-2), 0.7
+    )
     n = stage.simulation.particles.count[None]
     sample = TrainingSample(
         stage, scales, np.zeros((n, 3)), np.ones(n, bool), pairs=head == "pressure"
@@ -82,7 +78,7 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     with torch.no_grad():
         fluid = stage.fluid
         down = torch.tensor((0.0, 0.0 if head == "direct" else -9.81, 0.0))
-        density, eta = fluid.equation_of_state.rest_density, fluid.rheology.eta
+        density, eta = fluid.rest_density, fluid.rheology.eta
         expected = model.step(sample, density, eta, down).acceleration.numpy()
     net = make_pcnet(model.weights(), stage.fluid, scales, stage.simulation.particles.capacity)
     if isinstance(net, DirectPcNet):
@@ -102,14 +98,14 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
 def one_step_error(course: TrainingRuns, weights: Weights) -> float:
     """Root mean square error of the acceleration over the held-out run [m/s^2]."""
     run, net, wrong = course.held[0], course.pcnet(weights), []
-    particles = course.stage.simulation.particles
+    particles = course.replay.simulation.particles
     for frame in range(20, len(run), 8):
         course.put(run, frame)
-        course.stage.simulation.model = net
+        course.replay.simulation.model = net
         net.accelerate(
             particles,
-            course.stage.simulation.wall,
-            course.stage.simulation.neighbors,
+            course.replay.simulation.wall,
+            course.replay.simulation.neighbors,
             course.scene.gravity,
         )
         n = particles.count[None]
@@ -177,7 +173,7 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, tmp_pa
 
 def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
     """The physics takes four steps a frame; rolled out from the first frame it is the recording."""
-    figures = course.rollout(course.stage.physics, course.held[0])
+    figures = course.rollout(course.replay.physics, course.held[0])
     assert figures["survived"] == 1.0
     # Of a way of some tenths of a spacing; behind in time by half it would be 0.75 off.
     assert figures["path_error"] < 0.1
@@ -186,12 +182,12 @@ def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
 def test_ridge_finds_a_straight_line(course, monkeypatch):
     """Targets that are linear in the features, with an offset, are met nearly exactly."""
     features, _ = course.examples(32)
-    spread = features[:, :COUNT].std(axis=0, keepdims=True).T.clip(1e-3)
-    line = np.random.default_rng(0).normal(size=(COUNT, 3)) / spread
-    target = (features[:, :COUNT] @ line + 3.0) * course.scales.acceleration
+    spread = features[:, :PAPER_COUNT].std(axis=0, keepdims=True).T.clip(1e-3)
+    line = np.random.default_rng(0).normal(size=(PAPER_COUNT, 3)) / spread
+    target = (features[:, :PAPER_COUNT] @ line + 3.0) * course.scales.acceleration
     monkeypatch.setattr(course, "examples", lambda _: (features, target))
     weights = ridge(course, Settings(head="direct"))
-    found = weights.evaluate(features[:, :COUNT]) * course.scales.acceleration
+    found = weights.evaluate(features[:, :PAPER_COUNT]) * course.scales.acceleration
     # The penalty is a thousandth of a feature's variance.
     assert np.abs(found - target).max() < 0.02 * np.abs(target - target.mean(axis=0)).max()
 
@@ -200,5 +196,5 @@ def test_persistence_gives_back_the_previous_acceleration(course):
     weights = persistence(course, Settings(head="direct"))
     features, _ = course.examples(1)
     np.testing.assert_allclose(
-        weights.evaluate(features[:, :COUNT]), features[:, :3], rtol=1e-4, atol=1e-9
+        weights.evaluate(features[:, :PAPER_COUNT]), features[:, :3], rtol=1e-4, atol=1e-9
     )

@@ -159,7 +159,7 @@ def test_a_script_that_cannot_be_done_ends_the_run(
 # A network that does not fit the blood
 
 
-UNFIT = "pcnet.npz: thickening is 17.32 in the weights, 1 in the scene"
+UNFIT = "pcnet.npz: viscosity_ratio is 17.32 in the weights, 1 in the scene"
 
 
 @pytest.fixture

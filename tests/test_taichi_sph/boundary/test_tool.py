@@ -10,7 +10,7 @@ from builders import CAPACITY, SKIN, D, Prescribed, R, Setup, precision
 from reference import separations
 from taichi_sph.boundary.tool import LARGEST_SPEED, RESPONSE_TIME, Tool
 from taichi_sph.boundary.tool_surface import ToolSurface
-from taichi_sph.fluid.wcsph import AccelerationModel
+from taichi_sph.fluid.model import AccelerationModel
 from tool_stage import AT, BALL, ROUNDING, TURN, hold, proxies
 
 # Lists

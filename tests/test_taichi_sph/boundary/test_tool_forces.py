@@ -18,7 +18,7 @@ from builders import (
     make_model,
     precision,
 )
-from nn.features import GATHERED, FeatureScales, extract
+from nn.features import ROW_COUNT, SPEED_KURTOSIS, SPEED_SKEWNESS, FeatureScales, extract
 from reference import Blood
 from taichi_sph.fluid.implicit import ImplicitAcceleration
 from taichi_sph.fluid.rheology import Casson
@@ -135,13 +135,13 @@ def test_blood_vessel_and_tool_in_a_moving_train_accelerate_alike(stage, surface
 
 def test_the_implicit_pressure_in_a_moving_train_is_the_same(stage, surface):
     hold(stage, surface, AT, TURN, *MOTION)
-    model = ImplicitAcceleration(THIN, CAPACITY, 2e-4, rounds=2)
+    model = ImplicitAcceleration(THIN, CAPACITY, 2e-4, iterations=2)
     found = []
     for _ in range(2):
         stage.build()
         model.accelerate(stage.particles, stage.wall, stage.neighbors, (0.0, 0.0, 0.0))
         found.append([stage.in_order(f) for f in (
-            stage.particles.acceleration, model.physics.pressure_term, model.physics.viscosity
+            stage.particles.acceleration, model.pressure_term, model.viscosity
         )])  # fmt: skip
         in_the_train(stage)
     for at_rest, moving in zip(*found, strict=True):
@@ -153,12 +153,12 @@ def test_features_in_a_moving_train_are_the_same(stage, surface):
     found = []
     for _ in range(2):
         stage.build()
-        out = ndarray(float, (CAPACITY, GATHERED))
+        out = ndarray(float, (CAPACITY, ROW_COUNT))
         extract(stage.particles, stage.wall, stage.neighbors, THIN, SCALES, out)
         found.append(out.to_numpy()[: stage.particles.count[None]])
         in_the_train(stage)
     # Skewness and kurtosis of speeds jump where rounding moves a speed to the next bin.
-    smooth = [k for k in range(GATHERED) if k not in (13, 15)]
+    smooth = [k for k in range(ROW_COUNT) if k not in (SPEED_SKEWNESS, SPEED_KURTOSIS)]
     for k in smooth[3:]:
         assert_close(found[1][:, k], found[0][:, k], FRAME[precision()])
 
@@ -167,7 +167,7 @@ def test_divergence_feels_the_tool_come(stage, surface):
     """d(rho)/dt by brute force, proxies' own motion in it."""
     hold(stage, surface, AT, TURN, *MOTION)
     stage.build()
-    out = ndarray(float, (CAPACITY, GATHERED))
+    out = ndarray(float, (CAPACITY, ROW_COUNT))
     extract(stage.particles, stage.wall, stage.neighbors, THIN, SCALES, out)
     found = out.to_numpy()[: stage.particles.count[None], 24] / -SCALES.frame_interval
     moving = brute_force(stage, THIN)

@@ -9,9 +9,9 @@ from builders import DENSITY, SPHERE, D, R, ball, make_fluid, precision, sphere
 from reference import Blood, wendland_gradient
 from taichi_sph.fluid.implicit import (
     DAMPING,
-    LARGEST_ADVANCE,
-    LEAST_RESPONSE,
+    LARGEST_ADVECTIVE_CFL,
     RELAXATION,
+    SMALLEST_DIAGONAL,
     STIFFNESS,
     ImplicitAcceleration,
 )
@@ -28,7 +28,7 @@ def response_of(grad: np.ndarray, wall: np.ndarray, share: float) -> np.ndarray:
     """D_i [1/m^2] of the gradients of blood (n, n, 3) and the sums over the wall (n, 3)."""
     one_sided = share * grad.sum(axis=1) + wall
     d = (one_sided**2).sum(axis=1) + share**2 * (grad**2).sum(axis=(1, 2))
-    return np.maximum(d, LEAST_RESPONSE / R**2)
+    return np.maximum(d, SMALLEST_DIAGONAL / R**2)
 
 
 def brute_force(blood: Blood, rounds: int) -> tuple[np.ndarray, float]:
@@ -129,4 +129,6 @@ def test_the_step_shortens_for_fast_blood():
     assert model.stable_step(0.0, 1e9) == INTERVAL
     assert model.stable_step(0.1 * R / INTERVAL, 1e9) == INTERVAL
     fast = 4.0 * R / INTERVAL
-    assert model.stable_step(fast, 1e9) * fast == pytest.approx(LARGEST_ADVANCE * R, rel=1e-12)
+    assert model.stable_step(fast, 1e9) * fast == pytest.approx(
+        LARGEST_ADVECTIVE_CFL * R, rel=1e-12
+    )

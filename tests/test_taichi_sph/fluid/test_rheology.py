@@ -69,7 +69,7 @@ def test_casson_thins_as_it_is_sheared():
 
 
 def test_casson_never_exceeds_its_largest_viscosity():
-    for law in (BLOOD, Casson(ETA, TAU_Y, N, printed=True)):
+    for law in (BLOOD, Casson(ETA, TAU_Y, N, as_printed=True)):
         assert viscosities(law, [0.0, *RATES]).max() <= law.largest_viscosity * (1 + 1e-6)
 
 
@@ -87,7 +87,7 @@ def test_newtonian_viscosity_does_not_depend_on_the_shear_rate():
 
 
 def test_printed_form_is_thin_at_rest_and_thickest_at_a_low_shear_rate():
-    printed = Casson(ETA, TAU_Y, N, printed=True)
+    printed = Casson(ETA, TAU_Y, N, as_printed=True)
     at_rest, at_peak = viscosities(printed, [0.0, 0.179])
     # sqrt(tau_y g) n at the smallest rate that is evaluated, 1e-6 1/s, doubled by the square.
     assert at_rest == pytest.approx(ETA, rel=2e-2)
@@ -105,4 +105,4 @@ def test_viscosity_is_a_number_at_rest_and_at_any_rate(n, printed):
 def test_scene_tables_become_the_laws_they_name():
     assert make_rheology(NewtonianTable(viscosity=4e-3)) == Newtonian(4e-3)
     table = CassonTable(viscosity=3e-3, yield_stress=6e-3, regularisation=9.0, printed=True)
-    assert make_rheology(table) == Casson(3e-3, 6e-3, 9.0, printed=True)
+    assert make_rheology(table) == Casson(3e-3, 6e-3, 9.0, as_printed=True)
