@@ -54,3 +54,11 @@ def test_pressure_is_equation_14_where_that_is_positive_and_else_zero(state):
 def test_pressure_is_never_below_zero(state):
     assert pressures(state, DENSITY * np.linspace(0.0, 1.0, 201)).min() >= 0.0
     assert pressures(state, [0.5 * DENSITY])[0] == 0.0
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_the_law_in_numpy_is_the_law_in_the_kernels(state):
+    rho = DENSITY * np.linspace(0.5, 1.5, 61)
+    limit = 20 * SAME[precision()] * DENSITY * C**2
+    np.testing.assert_allclose(pressures(state, rho), state.pressure_of(rho), atol=limit, rtol=0)
+    assert state.pressure_of(rho).max() > DENSITY * C**2
