@@ -463,16 +463,6 @@ def test_a_capped_opening_carries_proxies_and_an_open_one_does_not() -> None:
     assert on_axis.sum() == pytest.approx(0.64 * math.pi * RADIUS**2 / 1e-6, rel=0.1)
 
 
-def test_proxies_of_a_bend_that_nearly_touches_itself_are_dropped() -> None:
-    # Two plates a third of a setback apart outside: proxies of one stand in the other's lumen.
-    vertices, faces = bent(1.999 * np.pi)
-    vessel = build_vessel(vertices, faces, {}, 1.0, "ring")
-    setback = 0.5e-3
-    wall = vessel.sample_wall(1e-3, setback)
-    assert wall.dropped > 50  # the two ends face each other a few micrometres apart
-    assert vessel.signed_distance(wall.positions).min() > 0.4 * setback
-
-
 def test_sampling_repeats_to_the_last_bit_and_follows_the_seed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
