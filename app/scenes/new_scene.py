@@ -13,7 +13,7 @@ from app.scenes.scene_folder import publish, readme_text, scene_text
 from app.scenes.smoothing import smoothed
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
-from taichi_sph.geometry.caps import BULGE
+from taichi_sph.geometry.caps import BULGE, refuse_shells
 from taichi_sph.geometry.findings import LARGEST_RADIUS, LARGEST_VOLUME, crossings, text_of
 from taichi_sph.geometry.mending import largest_piece, mend
 from taichi_sph.geometry.mesh import Floats, Integers
@@ -167,6 +167,7 @@ def _tidy(
 ) -> tuple[Floats, Integers]:
     """One piece, triangles turning alike."""
     vertices, faces, mended = mend(vertices, faces, label)
+    refuse_shells(vertices, faces, label)
     vertices, faces, left = largest_piece(vertices, faces, label)
     notes += mended + left
     if not mesh.is_winding_consistent(faces) and (mesh.edge_uses(faces)[2] <= 2).all():

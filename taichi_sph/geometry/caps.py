@@ -7,6 +7,7 @@ itself: caps are fanned from a displaced middle, smoothed, or meshed anew with t
 import math
 from dataclasses import dataclass
 
+import igl
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -30,6 +31,8 @@ of which 45 degrees are seen stands off by 0.41, an oblate one of 1:4 by this.""
 ROUND, OVAL = 0.6, 0.4
 """4 pi area / rim^2 that an end reaches: a disc 1, a square 0.785, a strip of 1:2 0.70.  A flat end
 between the two is named and not taken; a hole there is one that was cut on purpose."""
+SHELL = 0.01
+"""A piece of a smaller share of the area is a crumb."""
 STEEP = 0.75
 """Mean |cosine| between the wall at a rim and the end's normal; at a cut of 60 degrees 0.55."""
 
@@ -191,6 +194,36 @@ def wall_sentence(label: str, place: Floats, scale: float) -> str:
         f"{label}: the flat end at {where(place / scale)} in units of the file has a hole in it: "
         "this is a wall, not a lumen; give the inner surface"
     )
+
+
+def refuse_shells(vertices: Floats, faces: Integers, label: str, scale: float = 1.0) -> None:
+    """Refuse two skins of which one lies in the other: the inside and the outside of a wall.
+
+    Args:
+        vertices: (n, 3).
+        faces: (m, 3), of any number of pieces, open or closed.
+        label: What messages call the surface.
+        scale: Of the vertices, over the units of the file, in which places are said.
+
+    Raises:
+        InputError: there are two such.
+    """
+    count, piece = mesh.components(faces) if len(faces) else (0, np.zeros(0, np.int64))
+    if count < 2:
+        return
+    areas = np.linalg.norm(mesh.face_vectors(vertices, faces), axis=1)
+    size = np.bincount(piece, areas)
+    outer = int(size.argmax())
+    tree = igl.FastWindingNumberBVH()
+    tree.init(*mesh.drop_unused(vertices, np.ascontiguousarray(faces[piece == outer], np.int64)))
+    for inner in np.flatnonzero(size > SHELL * size.sum()):
+        points = np.ascontiguousarray(vertices[np.unique(faces[piece == inner])])
+        within = np.abs(np.asarray(tree.winding_number(points)).reshape(-1)) > 0.5
+        if inner != outer and within.mean() > 0.5:
+            raise InputError(
+                f"{label}: a surface lies within another (at {where(points.mean(axis=0) / scale)} "
+                "in units of the file): this is a wall, not a lumen; give the inner surface"
+            )
 
 
 def find_caps(vertices: Floats, faces: Integers, label: str, scale: float = 1.0) -> list[Cap]:

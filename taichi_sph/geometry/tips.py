@@ -2,7 +2,7 @@
 
 A tip is a local maximum of the distance along the surface from another tip, if it stands out by
 more than the vessel is wide.  The surface beyond a section has a vector area equal to the section's
-(divergence theorem), which gives the branch's axis and radius there.
+(divergence theorem), which gives the branch's radius there.
 """
 
 import math
@@ -41,6 +41,7 @@ def find_tips(vertices: Floats, faces: Integers) -> list[Tip]:
     """
     if mesh.genus(faces) > 0:
         return []
+    vertices, faces = mesh.drop_unused(vertices, faces)
     area = float(np.linalg.norm(mesh.face_vectors(vertices, faces), axis=1).sum())
     radius = 2.0 * abs(mesh.enclosed_volume(vertices, faces)) / area
     edges = mesh.edge_uses(faces)[0]
@@ -115,8 +116,19 @@ def _tip(vertices: Floats, faces: Integers, away: Floats, tip: int, out: float) 
         if reach >= min(3.0 * radius, 0.95 * out):
             break
         reach = 3.5 * radius if reach < radius else 1.3 * reach
-    axis = mesh.unit(vectors[members].sum(axis=0))
-    return Tip(vertices[tip], axis, radius, members)
+    return Tip(vertices[tip], _axis(vectors[members]), radius, members)
+
+
+def _axis(vectors: Floats) -> Floats:
+    """Unit vector out of the end of a tube, from its triangles' normals times areas (m, 3).
+
+    The wall's normals are square to it: sum A n n^T is least along it.  The section that a coarse
+    mesh is cut off at is no help, for it is oblique.
+    """
+    area = np.linalg.norm(vectors, axis=1, keepdims=True)
+    spread = vectors.T @ (vectors / np.where(area > 0.0, area, 1.0))
+    axis = np.linalg.eigh(spread)[1][:, 0]
+    return np.asarray(axis if axis @ vectors.sum(axis=0) >= 0.0 else -axis)
 
 
 def _part(above: np.ndarray, pairs: Integers, seed: int, least: Integers) -> Integers:

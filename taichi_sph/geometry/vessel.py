@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import clearance, filling, mesh, wall_sampling
-from taichi_sph.geometry.caps import flat_part_at
+from taichi_sph.geometry.caps import flat_part_at, refuse_shells
 from taichi_sph.geometry.closed_surface import ClosedSurface
 from taichi_sph.geometry.gaps import gaps_at
 from taichi_sph.geometry.interior import Interior
@@ -340,6 +340,7 @@ def build_vessel(
             f"{SMALLEST:g} to {LARGEST:g} m; if these are {kind}, set vessel.scale = {guess:g}"
         )
     vertices, faces, notes = mend(vertices, faces, label)
+    refuse_shells(vertices, faces, label, scale)
     require_manifold(vertices, faces, label, scale)
     mesh.log_stage("finding openings", len(faces))
     vertices, faces, holes = close_holes(vertices, faces, label, scale)

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.scenes.centreline import Box, Tube, make_surface, read_shape, remake
+from app.scenes import branching
+from app.scenes.centreline import make_surface, remake
+from app.scenes.vessel_table import Box, Branch, Centrelines, End, Tube, read_shape
 from places import VESSELS
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
@@ -148,3 +150,49 @@ def test_crossing_triangles_are_found() -> None:
     spike = int(np.argmax(vertices[:, 0] - np.abs(vertices[:, 2])))
     vertices[spike, 0] = -7e-3
     assert len(mesh.self_intersections(vertices, faces)) > 2
+
+
+def side_by_side(apart: float) -> Centrelines:
+    """A trunk that divides into two parallel branches so far apart [mm]; one goes on farther."""
+
+    def branch(name: str, stations: list[tuple[float, float]], end: str) -> Branch:
+        points = [(float(x), 0.0, float(z), 2.0) for x, z in stations]
+        return Branch(name=name, points=points, end=end)
+
+    def end(name: str, x: float, z: float, sign: float) -> End:
+        return End(name=name, centre=(x, 0.0, z), normal=(0.0, 0.0, sign), radius=2.0)
+
+    x = apart
+    return Centrelines(
+        name="legs",
+        branches=[
+            branch("a", [(0, 0), (0, 5), (0, 10), (0, 15), (0, 20)], "top"),
+            branch("b", [(0, 2), (2.5, 5), (x, 9), (x, 14), (x, 20), (x, 26), (x, 30)], "high"),
+            branch("trunk", [(0, 2), (0, -4), (0, -10)], "low"),
+        ],
+        openings=[end("top", 0, 20, 1), end("high", x, 30, 1), end("low", 0, -10, -1)],
+        smoothing_length=0.1,
+    )
+
+
+@pytest.mark.parametrize("apart", [4.6, 5.5])
+def test_a_branch_that_passes_an_opening_is_not_cut_with_it(
+    apart: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(branching, "TRIANGLES", 3000)
+    vertices, faces = make_surface(side_by_side(apart))
+    assert mesh.is_closed(faces)
+    assert mesh.genus(faces) == 0
+    flat = [cap for cap in find_caps(vertices, faces, "legs") if cap.is_flat]
+    heights = sorted(float(cap.centre[2]) for cap in flat)
+    assert heights == pytest.approx([-0.01, 0.02, 0.03], abs=1e-6)
+    # At 3000 triangles a circle is a polygon of some 20 corners.
+    assert [cap.radius for cap in flat] == pytest.approx([2e-3] * 3, rel=0.03)
+
+
+def test_a_branch_that_grows_into_a_prolonged_end_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(branching, "TRIANGLES", 3000)
+    with pytest.raises(InputError, match="'top' cannot be cut off: another branch runs into"):
+        make_surface(side_by_side(2.5))

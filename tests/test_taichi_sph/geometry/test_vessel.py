@@ -1,7 +1,6 @@
-"""Vessels: distances, openings, mistakes in files, proxies, the blood at the start."""
+"""Vessels: distances, openings, mistakes in files, leaks, the narrowest place."""
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from meshes import (
     LENGTH,
     RADIUS,
     TOP,
-    bent,
     cylinder,
     pipe,
     tables,
@@ -21,26 +19,11 @@ from meshes import (
 )
 from places import VESSELS
 from taichi_sph.errors import InputError
-from taichi_sph.geometry import mesh, wall_sampling
-from taichi_sph.geometry.caps import find_caps
+from taichi_sph.geometry import mesh
 from taichi_sph.geometry.findings import check_vessel
 from taichi_sph.geometry.interior import Interior
 from taichi_sph.geometry.vessel import Vessel, build_vessel, read_vessel
 from taichi_sph.scene import Column, OpeningTable, read_scene
-
-SCENES = sorted(path.relative_to(VESSELS).as_posix() for path in VESSELS.glob("*/scene.toml"))
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """No test reads or writes the user's cache."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "vesselflow"
-
-
-@pytest.fixture(scope="module")
-def aorta() -> Vessel:
-    return read_vessel(read_scene(VESSELS / "aortoiliac" / "scene.toml"))
 
 
 def closed_vessel(vertices: np.ndarray, faces: np.ndarray) -> Vessel:
@@ -314,82 +297,6 @@ def test_a_column_that_does_not_fit_is_refused(column: Column, words: list[str])
         assert word in str(error.value)
 
 
-# Blood at the start
-
-
-def test_a_box_is_filled_to_the_last_place() -> None:
-    scene = read_scene(VESSELS / "box" / "scene.toml")
-    vessel = read_vessel(scene)
-    blood = vessel.fill_column(scene.column, 1e-3)
-    assert len(blood) == 16 * 16 * 20
-    assert blood.min(axis=0) == pytest.approx([-7.5e-3, -7.5e-3, -19.5e-3], abs=1e-8)
-    assert blood.max(axis=0) == pytest.approx([7.5e-3, 7.5e-3, -0.5e-3], abs=1e-8)
-
-
-@pytest.mark.parametrize("wanted", [500, 1234])
-def test_the_column_has_the_number_asked_for(aorta: Vessel, wanted: int) -> None:
-    spacing = 0.9e-3
-    column = Column(opening="inlet_abdominal_aorta", particles=wanted)
-    blood = aorta.fill_column(column, spacing)
-    assert len(blood) == wanted
-    assert len(np.unique(np.round(blood / spacing * 100), axis=0)) == wanted
-    assert aorta.signed_distance(blood).max() <= -0.499 * spacing
-    opening = aorta.openings[0]
-    depth = (opening.centre - blood) @ opening.normal
-    assert depth.min() == pytest.approx(0.5 * spacing)
-    # As shallow as can be: it fills all layers but its last.
-    full = aorta.fill_column(
-        Column(opening="inlet_abdominal_aorta", height=depth.max() - 0.4 * spacing), spacing
-    )
-    assert len(full) <= wanted
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_shipped_scenes_fill_strictly_inside_and_leak_nothing(name: str) -> None:
-    scene = read_scene(VESSELS / name)
-    vessel = read_vessel(scene)
-    spacing = scene.discretization.spacing
-    blood = vessel.fill_column(scene.column, spacing)
-    assert 3000 <= len(blood) <= 6000
-    assert vessel.signed_distance(blood).max() <= -0.498 * spacing
-    assert vessel.count_leaks(blood) == 0
-    assert vessel.narrowest / spacing > 6.0
-    # The column stands below its opening: gravity points into the lumen there.
-    opening = vessel.opening(scene.column.opening)
-    gravity = np.array(scene.gravity)
-    assert gravity @ opening.normal < -0.5 * np.linalg.norm(gravity)
-    assert all(finding.good for finding in check_vessel(vessel))
-
-
-@pytest.mark.parametrize("name", ["aortoiliac/A.toml", "portal_vein/B.toml"])
-def test_scenes_of_the_papers_sizes_hold_16_000_and_32_000(name: str) -> None:
-    scene = read_scene(VESSELS / name)
-    vessel = read_vessel(scene)
-    spacing, column = scene.discretization.spacing, scene.column
-    assert column.particles == 16_000
-    proxies = vessel.wall_area / (spacing * scene.discretization.wall_spacing_ratio) ** 2
-    assert proxies == pytest.approx(56_000 if "A" in name else 73_000, rel=0.02)
-    twice = vessel.fill_column(Column(opening=column.opening, particles=32_000), spacing)
-    assert len(twice) == 32_000
-
-
-def test_a_column_stays_in_the_leg_of_its_opening() -> None:
-    vertices, faces = bent()
-    ends = [
-        mesh.region_plane(vertices, faces[cap.faces])[0]
-        for cap in find_caps(vertices, faces, "bend")
-    ]
-    left, right = sorted(ends, key=lambda centre: centre[0])
-    openings = {
-        name: OpeningTable(centre=tuple(centre)) for name, centre in (("a", left), ("b", right))
-    }
-    vessel = build_vessel(vertices, faces, openings, 1.0, "bend")
-    blood = vessel.fill_column(Column(opening="a", height=0.004), 1e-3)
-    assert blood[:, 0].max() < 0  # not in the other leg, though it is as deep there
-    both = vessel.fill_column(Column(opening="a", particles=1800), 1e-3)
-    assert both[:, 0].max() > 0  # round the bend
-
-
 # Leaks
 
 
@@ -409,118 +316,6 @@ def test_leaks_are_counted_against_the_mesh() -> None:
     assert vessel.count_leaks(outside) == 4
     assert vessel.count_leaks(outside, tolerance=2e-4) == 2
     assert vessel.count_leaks(np.zeros((0, 3))) == 0
-
-
-# Wall
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.5])
-def test_proxies_are_even_set_back_and_of_the_right_number(aorta: Vessel, ratio: float) -> None:
-    spacing, setback = 0.9e-3 * ratio, 0.45e-3
-    wall = aorta.sample_wall(spacing, setback, seed=3)
-    assert len(wall.positions) + wall.dropped == round(aorta.wall_area / spacing**2)
-    assert len(wall.positions) == pytest.approx(aorta.wall_area / spacing**2, rel=0.02)
-    assert wall.nearest_spread < 0.07
-    assert 0.85 < wall.nearest_mean < 1.0
-    assert wall.nearest_least > 0.6
-    assert wall.largest_gap < 0.95
-    assert np.linalg.norm(wall.normals, axis=1) == pytest.approx(1.0)
-    distance = aorta.signed_distance(wall.positions)
-    assert distance.min() > 0.4 * setback
-    assert distance.max() < 1.01 * setback
-    assert np.median(distance) == pytest.approx(setback, rel=0.01)
-    for opening in aorta.openings:
-        apart = wall.positions - opening.centre
-        near = np.linalg.norm(apart, axis=1) < 2 * opening.radius
-        height = apart[near] @ opening.normal
-        # Flush: none beyond the plane, some right at it.
-        assert height.max() <= 1e-7
-        assert height.max() > -0.5 * spacing
-
-
-def test_gaps_are_what_an_independent_search_finds(aorta: Vessel) -> None:
-    spacing = 1e-3
-    points, nearest = wall_sampling.relaxed_points(aorta.vertices, aorta.wall_faces, spacing, 0)
-    corners = aorta.vertices[aorta.wall_faces[nearest]]
-    normal = mesh.unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    assert np.abs(np.einsum("ij,ij->i", points - corners[:, 0], normal)).max() < 1e-9
-    probes, _ = trimesh.sample.sample_surface(
-        trimesh.Trimesh(aorta.vertices, aorta.wall_faces, process=False), 40_000, seed=5
-    )
-    gap = np.sqrt(((probes[:, None] - points[None, ::40]) ** 2).sum(axis=2)).min(axis=1)
-    assert gap.max() > 2 * spacing  # every 40th point leaves holes: the measure sees them
-    figures = wall_sampling.spacing_statistics(points, aorta.vertices, aorta.wall_faces, spacing)
-    thinned = wall_sampling.spacing_statistics(
-        points[::2], aorta.vertices, aorta.wall_faces, spacing
-    )
-    assert thinned[3] > 1.0 > figures[3]
-
-
-def test_a_capped_opening_carries_proxies_and_an_open_one_does_not() -> None:
-    wall = pipe(bottom="capped").sample_wall(1e-3, 0.5e-3)
-    on_axis = np.hypot(wall.positions[:, 0], wall.positions[:, 1]) < 0.8 * RADIUS
-    assert (wall.positions[on_axis][:, 2] < BOTTOM[2]).all()
-    assert on_axis.sum() == pytest.approx(0.64 * math.pi * RADIUS**2 / 1e-6, rel=0.1)
-
-
-def test_proxies_of_a_bend_that_nearly_touches_itself_are_dropped() -> None:
-    # Two plates a third of a setback apart outside: proxies of one stand in the other's lumen.
-    vertices, faces = bent(1.999 * np.pi)
-    vessel = build_vessel(vertices, faces, {}, 1.0, "ring")
-    setback = 0.5e-3
-    wall = vessel.sample_wall(1e-3, setback)
-    assert wall.dropped > 50  # the two ends face each other a few micrometres apart
-    assert vessel.signed_distance(wall.positions).min() > 0.4 * setback
-
-
-def test_sampling_repeats_to_the_last_bit_and_follows_the_seed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    first = pipe().sample_wall(1e-3, 0.5e-3, seed=1)
-    again = pipe().sample_wall(1e-3, 0.5e-3, seed=1)
-    other = pipe().sample_wall(1e-3, 0.5e-3, seed=2)
-    assert first.positions.tobytes() == again.positions.tobytes()
-    assert first.normals.tobytes() == again.normals.tobytes()
-    assert not np.array_equal(first.positions, other.positions)
-
-
-def test_the_cache_gives_the_same_points_and_survives_damage(
-    monkeypatch: pytest.MonkeyPatch, own_cache: Path
-) -> None:
-    monkeypatch.setattr(wall_sampling, "_CACHE_FROM", 0)
-    first = pipe().sample_wall(1e-3, 0.5e-3)
-    (file,) = own_cache.iterdir()
-    calls = []
-    real = wall_sampling.relaxed_points
-
-    def counted(*given):
-        calls.append(given)
-        return real(*given)
-
-    monkeypatch.setattr(wall_sampling, "relaxed_points", counted)
-    stored = pipe().sample_wall(1e-3, 0.5e-3)
-    assert not calls
-    assert stored.positions.tobytes() == first.positions.tobytes()
-    assert stored.largest_gap == first.largest_gap
-    pipe(bottom="capped").sample_wall(1e-3, 0.5e-3)
-    pipe().sample_wall(1e-3, 0.4e-3)
-    assert len(calls) == 2  # another wall or setback has another key
-    for damage in (b"", file.read_bytes()[:300], b"garbage" * 50):
-        calls.clear()
-        file.write_bytes(damage)
-        again = pipe().sample_wall(1e-3, 0.5e-3)
-        assert len(calls) == 1
-        assert again.positions.tobytes() == first.positions.tobytes()
-
-
-def test_a_cache_that_cannot_be_written_is_no_error(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(wall_sampling, "_CACHE_FROM", 0)
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    monkeypatch.setenv("XDG_CACHE_HOME", os.fspath(blocked))
-    assert len(pipe().sample_wall(1e-3, 0.5e-3).positions) > 900
 
 
 # Narrowest place
