@@ -12,7 +12,11 @@ from pathlib import Path
 import pytest
 
 from builders import vesselflow
-from taichi_sph.runtime import start
+from taichi_sph import runtime as taichi_runtime
+
+start = taichi_runtime.start
+# A command that is called in this process must not start Taichi again: all fields would be gone.
+taichi_runtime.start = lambda *_, **__: None
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -136,9 +136,13 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             axes.axvline(1.0, color="grey", lw=1, ls=":")
             if floor is not None and error != "compression":
                 axes.axhline(100.0 * getattr(floor, error), color="grey", lw=1, ls="--")
-            axes.set(xscale="log", yscale="log", ylabel=label)
+            axes.set(xscale="log", ylabel=label)
             axes.margins(y=0.15)
-            for axis in (axes.xaxis, axes.yaxis):
+            # At rest some errors are none, or relative to nothing: no place on a logarithm.
+            is_logarithmic = any(getattr(row, error) > 0.0 for row in usable if not row.died)
+            if is_logarithmic:
+                axes.set_yscale("log")
+            for axis in (axes.xaxis, axes.yaxis)[: 1 + is_logarithmic]:
                 axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
                 axis.set_major_formatter(StrMethodFormatter("{x:g}"))
                 axis.set_minor_formatter(NullFormatter())
