@@ -22,6 +22,18 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
+def make_bar(console: Console, transient: bool = False) -> Bar:
+    """A bar with a title, a state in words and the time since it began, to be started."""
+    return Bar(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[state]}", markup=False),
+        TimeElapsedColumn(),
+        console=console,
+        transient=transient,
+    )
+
+
 class Progress:
     """Simulated time, real-time factor and time left, on stderr."""
 
@@ -33,13 +45,7 @@ class Progress:
         self._shown = -1e9
         self._bar: Bar | None = None
         if self._console.is_terminal:
-            self._bar = Bar(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                TextColumn("{task.fields[state]}", markup=False),
-                TimeElapsedColumn(),
-                console=self._console,
-            )
+            self._bar = make_bar(self._console)
             self._task = self._bar.add_task(
                 title, total=until if math.isfinite(until) else None, state="compiling"
             )

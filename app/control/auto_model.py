@@ -1,6 +1,5 @@
 """ModelSelection: the models of a session, which of them computes, and the choice of `auto`."""
 
-import hashlib
 from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING
 from app.models import MODELS, model_factory
 from app.scenes.library import weights_for
 from taichi_sph.errors import InputError
+from taichi_sph.scene_files import file_hash
 
 if TYPE_CHECKING:
     from taichi_sph.diagnostics import Diagnostics
@@ -126,4 +126,4 @@ class ModelSelection:
 def network_metadata(simulation: "Simulation", weights: Path | None) -> dict[str, str]:
     """Weights of a session's network, for its log: the file and the hash of its content."""
     file = (weights or weights_for(simulation.scene)).resolve()
-    return {"file": str(file), "hash": hashlib.sha256(file.read_bytes()).hexdigest()}
+    return {"file": str(file), "hash": file_hash(file)}

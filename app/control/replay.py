@@ -1,6 +1,5 @@
 """Replay: a session made again from its log, compared bit by bit."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from app.scenes.library import with_column
 from taichi_sph.errors import InputError
 from taichi_sph.runtime import start
 from taichi_sph.scene import Scene, parse_scene
-from taichi_sph.scene_files import found_in
+from taichi_sph.scene_files import file_hash, found_in
 from taichi_sph.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -89,10 +88,8 @@ def logged_run(path: Path, log: SessionLog) -> tuple[Scene, Path | None, dict[st
         expected = network["hash"] if network else None
     except (KeyError, TypeError):
         raise InputError(f"replay {path}: its head is not whole") from None
-    if weights is not None:
-        content = weights.read_bytes() if weights.is_file() else b""
-        if hashlib.sha256(content).hexdigest() != expected:
-            raise InputError(f"replay {path}: {weights} is not there as it was: the network's")
+    if weights is not None and file_hash(weights) != expected:
+        raise InputError(f"replay {path}: {weights} is not there as it was: the network's")
     try:
         # As it was, wherever it lies now.
         scene = found_in(scene, files, [Path(scene.folder), path.parent])

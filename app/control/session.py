@@ -244,12 +244,14 @@ class Session:
             if not held:
                 self.latency = max(self.latency, clock.perf_counter() - waiting.since)
 
+    def _now(self) -> dict[str, Any]:
+        return {"step": self.simulation.steps, "time": self.simulation.time}
+
     def _apply(
         self, command: Command, source: str, on_result: ResultListener | None = None
     ) -> None:
         """Do it, as far as it is allowed, and say and write down what was done."""
-        simulation = self.simulation
-        at = {"step": simulation.steps, "time": simulation.time}
+        at = self._now()
         try:
             done = command.apply(self)
         except InputError as error:
@@ -262,14 +264,13 @@ class Session:
             return
         if on_result is not None:
             on_result({"applied": as_dict(done), **at})
-        self._log_applied(done, source)
+        self._log_applied(done, source, at)
 
-    def _log_applied(self, done: Command, source: str) -> None:
-        simulation, row = self.simulation, as_dict(done)
+    def _log_applied(self, done: Command, source: str, at: dict[str, Any]) -> None:
+        """Write down and say what was done; `at` is the step that it came before, and its time."""
+        row = as_dict(done)
         if self._log is not None:
-            self._log.write(
-                {"step": simulation.steps, "time": simulation.time, "source": source, "do": row}
-            )
+            self._log.write({**at, "source": source, "do": row})
         text = ", ".join(f"{key} {value}" for key, value in row.items() if key != "command")
         self.notify(self.on_applied, f"{source}: {row['command']} {text}".rstrip())
 
@@ -289,7 +290,7 @@ class Session:
             self._log.write_frame(simulation, frame, diagnostics)
         self._status = self._status_of(simulation, frame, diagnostics)
         if name := self.models.choose(diagnostics.compression_p99):
-            self._log_applied(Model(name=name), "auto")  # type: ignore[arg-type]
+            self._log_applied(Model(name=name), "auto", self._now())  # type: ignore[arg-type]
 
     def _status_of(
         self, simulation: "Simulation", frame: int, diagnostics: "Diagnostics"

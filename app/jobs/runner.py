@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
 from app.jobs.cluster import run_on_cluster
 from app.jobs.process import ATTEMPTS, POLL, Event, Process, ProcessError
-from app.progress import LINE_EVERY, duration
+from app.progress import LINE_EVERY, duration, make_bar
 from taichi_sph.system import processors
 
 JobType = TypeVar("JobType")
@@ -55,14 +54,7 @@ class JobProgress:
         self._begun = self._shown = time.perf_counter()
         self._bar: Bar | None = None
         if self._console.is_terminal:
-            self._bar = Bar(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                TextColumn("{task.fields[state]}", markup=False),
-                TimeElapsedColumn(),
-                console=self._console,
-                transient=True,
-            )
+            self._bar = make_bar(self._console, transient=True)
             self._task = self._bar.add_task(title, total=count, state="")
             self._bar.start()
 

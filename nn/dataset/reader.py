@@ -27,8 +27,6 @@ from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene, parse_scene
 from taichi_sph.scene_files import named_files, sha256, with_files
 
-"""Recorded runs, read: checked when opened, rows when asked for."""
-
 
 def open_dataset(path: Path) -> h5py.File:
     """Open a finished dataset.

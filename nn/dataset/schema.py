@@ -40,7 +40,8 @@ from taichi_sph.errors import InputError
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """How every HDF5 file begins."""
 DATASET = "vesselflow dataset"
-UNDER_WAY = b'{"format": "vesselflow run under way"'
+RUN_UNDER_WAY = "vesselflow run under way"
+UNDER_WAY = f'{{"format": "{RUN_UNDER_WAY}"'.encode()
 """How the file of a run begins that is not finished."""
 SCHEMA = 2
 READABLE = (1, 2)

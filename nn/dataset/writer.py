@@ -23,6 +23,7 @@ import numpy as np
 
 from nn.dataset.schema import (
     DATASET,
+    RUN_UNDER_WAY,
     SCHEMA,
     UNDER_WAY,
     UNITS,
@@ -91,7 +92,7 @@ class Head:
     def write(self, file: BinaryIO) -> None:
         """Write it at the start of a file."""
         line = {
-            "format": json.loads(UNDER_WAY + b"}")["format"],
+            "format": RUN_UNDER_WAY,
             "schema": SCHEMA,
             "metadata": asdict(self.metadata),
             "feature_count": self.feature_count,

@@ -1,6 +1,5 @@
 """Settings of a training, and the recorded runs that it learns from and is judged by."""
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from taichi_sph.diagnostics import FEW, compression
 from taichi_sph.errors import RunError
 from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.geometry.vessel import read_vessel
+from taichi_sph.scene_files import sha256
 
 DIED = 0.3
 """99th percentile of compression at which a rollout counts as failed."""
@@ -94,7 +94,7 @@ class TrainingRuns:
             correction=settings.correction,
             seed=settings.seed,
             scene=facts.scene_name,
-            scene_hash=hashlib.sha256(facts.scene.encode()).hexdigest(),
+            scene_hash=sha256(facts.scene.encode()),
             command=command,
         )
 

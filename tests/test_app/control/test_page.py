@@ -370,7 +370,7 @@ def grid_of_rays(session: Any, count: int) -> tuple[np.ndarray, list[np.ndarray]
 def test_a_ray_hits_what_it_meets_and_nothing_else(session: Any) -> None:
     vertices = np.asarray(session.vessel.vertices, float)
     faces = np.asarray(session.vessel.faces, np.int64)
-    start, ways = grid_of_rays(session, 15)
+    start, ways = grid_of_rays(session, 19)
     hits = 0
     for way in ways:
         expected = brute_force_hit(start, way, vertices, faces)
@@ -380,7 +380,7 @@ def test_a_ray_hits_what_it_meets_and_nothing_else(session: Any) -> None:
             hits += 1
             # Single precision in libigl.
             np.testing.assert_allclose(found, start + expected * way, atol=1e-6)
-    assert 4 < hits < 0.5 * len(ways), "some hit and most miss"
+    assert 8 < hits < 0.5 * len(ways), "some hit and most miss"
 
 
 @needs_viser
