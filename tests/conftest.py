@@ -1,5 +1,6 @@
 """One Taichi per session: `ti.init` is global, and starting it again compiles all anew."""
 
+import functools
 import os
 
 from places import VESSELS
@@ -15,8 +16,14 @@ from builders import vesselflow
 from taichi_sph import runtime as taichi_runtime
 
 start = taichi_runtime.start
-# A command that is called in this process must not start Taichi again: all fields would be gone.
-taichi_runtime.start = lambda *_, **__: None
+
+
+@functools.wraps(start)
+def _already_started(*_: object, **__: object) -> None:
+    """Nothing: a command called in this process finds Taichi started, and all fields stay."""
+
+
+taichi_runtime.start = _already_started
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

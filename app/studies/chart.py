@@ -176,7 +176,7 @@ def run_timed(job: Job, rules: Rules | None) -> tuple[TimedRun, float]:
     interval = job.scene.frame_interval
     simulation = job.method.simulation(job.scene)
     grid = _grid_of(job.scene, simulation)
-    trace = Trace(interval, job.scene.discretization.spacing)
+    trace = Trace.of(job.scene)
     run = TimedRun(job.method.name, simulation, trace, grid, rules)
     load, loads = machine_load(), []
     for frame in range(1, job.frames + 1):

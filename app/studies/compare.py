@@ -89,7 +89,7 @@ def make_runs(
 
     def add(name: str, of: Scene, make: Callable[..., Any] = SphAcceleration) -> TimedRun:
         simulation = Simulation.from_scene(of, make, seed, vessel)
-        trace = Trace(scene.frame_interval, scene.discretization.spacing)
+        trace = Trace.of(scene)
         return TimedRun(name, simulation, trace)
 
     runs = [add(name, scene, model_factory(name, scene)) for name in ("physics", "implicit")]

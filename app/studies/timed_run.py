@@ -89,6 +89,8 @@ def broken_rule(
 
 RESTING = 0.01
 """Speed over the scene's below which blood is at rest."""
+FALLING = 0.9
+"""Blood that has moved by this of the way of a free fall is falling, however short the way is."""
 SETTLING = 0.1
 """Speed over the scene's that blood may gain where a start is not in balance."""
 
@@ -156,6 +158,8 @@ class Trace:
     """[s]"""
     spacing: float = 0.0
     """Between particles [m]; 0 where it was not kept."""
+    gravity: float = 0.0
+    """Size of gravity [m/s^2]; 0 where it was not kept."""
     drained: list[float] = field(default_factory=list)
     """Part that has left."""
     centre: list[np.ndarray] = field(default_factory=list)
@@ -170,6 +174,12 @@ class Trace:
     """Part outside the lumen."""
     slow: list[float] = field(default_factory=list)
     """Part at rest, of what is there: slower than RESTING of the scene's speed."""
+
+    @classmethod
+    def of(cls, scene: Scene) -> "Trace":
+        """An empty one, for a run of a scene."""
+        gravity = float(np.linalg.norm(scene.gravity))
+        return cls(scene.frame_interval, scene.discretization.spacing, gravity)
 
     def note(
         self, simulation: Simulation | Peer, figures: Diagnostics, blood: int, grid: Grid | None
@@ -188,16 +198,20 @@ class Trace:
 
 
 def is_at_rest(trace: Trace) -> bool:
-    """Whether the blood of a run stays where it is: its centre moves by less than a spacing.
+    """Whether the blood of a run stays where it is, and did not merely begin to fall.
 
-    Then its path, its momentum and its kinetic energy are next to nothing, and so is the meaning of
-    an error relative to them.
+    Its centre moves by less than a spacing, and by less than FALLING of a free fall's way.  Then
+    its path, its momentum and its kinetic energy are next to nothing, and so is the meaning of an
+    error relative to them.
     """
     centre = np.array(trace.centre).reshape(-1, 3)
     centre = centre[np.isfinite(centre).all(axis=1)]
     if len(centre) == 0 or max(trace.drained, default=0.0) > FEW:
         return False
-    return bool(np.linalg.norm(centre - centre[0], axis=1).max() < trace.spacing)
+    moved = float(np.linalg.norm(centre - centre[0], axis=1).max())
+    first, last = trace.frame_interval, trace.frame_interval * len(trace.centre)
+    fall = 0.5 * trace.gravity * (last**2 - first**2)
+    return moved < trace.spacing and (fall == 0.0 or moved < FALLING * fall)
 
 
 @dataclass(frozen=True)

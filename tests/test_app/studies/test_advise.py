@@ -37,7 +37,7 @@ from app.studies.timed_run import Trace
 from chart_rows import ROW
 from taichi_sph.errors import InputError, RunError
 
-RAMP_TIME = 0.2
+RISE = 0.2
 POURED = [m for m in METHODS if m.curve in PROBED]
 PCNET = next(m for m in METHODS if m.name == "pcnet")
 SCENE = find_scene("aortoiliac")
@@ -50,7 +50,7 @@ def poured(method: Method, died: str = "") -> Probe:
         0.01,
         drained=[0.0] * frames,
         centre=[np.array([0.0, 0.0, -0.1 * k]) for k in range(frames)],
-        energy=[1.0 + RAMP_TIME * (method.spacing - 1.0)] * frames,
+        energy=[1.0 + RISE * (method.spacing - 1.0)] * frames,
         compression=[0.02] * frames,
         slow=[0.25] * frames,
     )
@@ -121,7 +121,7 @@ def test_errors_and_costs_of_candidates_follow_from_pours_and_chart():
     """RISE (s - 1) beside spacing 1, whose own is RISE/2; the physics at four times the cost."""
     found = by_name([*map(poured, POURED)], charted(), SAFE)
     for method in POURED:
-        error = RAMP_TIME * math.hypot(method.spacing - 1.0, 0.5)
+        error = RISE * math.hypot(method.spacing - 1.0, 0.5)
         assert found[method.name].error == pytest.approx(error)
         cost = poured(method).wall_per_simulated
         assert found[method.name].wall_per_simulated == cost

@@ -7,7 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.studies.timed_run import RULES, Grid, TimedRun, Trace, broken_rule, clumped_part, errors_of
+from app.studies.timed_run import (
+    RULES,
+    Grid,
+    TimedRun,
+    Trace,
+    broken_rule,
+    clumped_part,
+    errors_of,
+    is_at_rest,
+)
 from taichi_sph.diagnostics import Diagnostics
 from taichi_sph.errors import RunError
 
@@ -142,3 +151,19 @@ def test_a_run_that_diverges_is_dead_from_then_on():
     assert pour.failure == "the run diverged"
     assert len(pour.trace.drained) == 1
     assert math.isnan(pour.wall_per_simulated)
+
+
+@pytest.mark.parametrize(
+    ("way", "gravity", "rests"),
+    [
+        (0.5 * 9.81, 9.81, False),  # it falls, if only for a moment
+        (0.02 * 9.81, 9.81, True),
+        (0.02 * 9.81, 0.0, True),  # nothing pulls
+        (30.0 * 9.81, 9.81, False),
+    ],
+)
+def test_blood_is_at_rest_that_stays_where_it_is_and_is_held_there(way, gravity, rests):
+    frames = np.arange(1, 5)
+    found = Trace(1e-2, 1e-2, gravity, drained=[0.0] * 4)
+    found.centre = [np.array([0.0, 0.0, -way * (1e-2 * k) ** 2]) for k in frames]
+    assert is_at_rest(found) == rests
