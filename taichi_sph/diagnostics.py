@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION
+
 FEW = 0.2
 """Part of the blood below which its centre of mass says little."""
 
@@ -95,6 +97,26 @@ def diagnose(
         max_speed=float(np.sqrt(speed2.max(initial=0.0))),
         fallback_share=simulation.fallback_share,
     )
+
+
+def diagnose_vessel(simulation: Any) -> Diagnostics:
+    """Diagnostics of a simulation of a scene; leaks are counted against the surface itself."""
+    counts = simulation.outlets.outflow_counts()
+    names = [o.name for o in simulation.vessel.openings]
+    left = counts[2:]
+    drained = {name: int(n) for name, n in zip(names, left, strict=False)}
+    density = simulation.particles.in_order(simulation.particles.density)
+    x = simulation.positions()
+    held = np.ones(len(x), bool)
+    for wound in simulation.wounds:
+        # Blood in the hole has not leaked.
+        held &= wound.distance(x) > wound.radius + 3.0 * simulation.scene.discretization.spacing
+    widened = simulation.wall.displacement_factor * simulation.wall.largest_amplitude
+    leaks = simulation.vessel.count_leaks(x[held], widened) + int(counts[OUT_OF_BOX])
+    return diagnose(
+        simulation, density, drained, leaks, added=simulation.inflow.added,
+        bled=int(left[len(names) :].sum()), sucked=int(counts[SUCTION]),
+    )  # fmt: skip
 
 
 def describe_divergence(simulation: Any, broken: int) -> str:

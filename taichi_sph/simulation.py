@@ -7,15 +7,15 @@ from typing import TypeVar
 import numpy as np
 
 from taichi_sph.assemble import Assembly, assemble
-from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.boundary import BloodFlow, Boundary, finite_numbers
 from taichi_sph.boundary.inflow import BufferZones
-from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION, Outlets
+from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.boundary.suction import Suction
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.boundary.wall_motion import MovingWall
 from taichi_sph.boundary.wounds import Wounds
 from taichi_sph.derived import Derived
-from taichi_sph.diagnostics import Diagnostics, describe_divergence, diagnose
+from taichi_sph.diagnostics import Diagnostics, describe_divergence, diagnose_vessel
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.fluid.model import AccelerationModel, Fluid
 from taichi_sph.fluid.wcsph import SphAcceleration
@@ -176,12 +176,11 @@ class Simulation:
         self.time = time
 
     def _require_future(self, time: float) -> None:
-        if isinstance(time, bool) or not isinstance(time, int | float | np.number):
-            raise InputError(f"advance_to: {time!r} is no time; allowed: a number of seconds")
-        if not math.isfinite(time) or time < self.time * (1.0 - SAME_TIME):
+        finite_numbers("advance_to: time [s]", time)
+        if time < self.time * (1.0 - SAME_TIME):
             raise InputError(
-                f"advance_to: {time:g} s is not ahead; blood is at {self.time:g} s and flows "
-                "forward only; allowed: that time or a later one"
+                f"advance_to: {time:g} s is past; blood is at {self.time:g} s and flows forward "
+                "only; allowed: that time or a later one"
             )
 
     # The state
@@ -232,11 +231,8 @@ class Simulation:
                 f"{len(position)} particles: there is room for {self.particles.capacity}, those of "
                 "the scene's column"
             )
-        for name, values in (("position", position), ("velocity", velocity)):
-            finite = np.isfinite(np.asarray(values, float)).reshape(len(position), -1).all(axis=1)
-            if not finite.all():
-                row = int(np.flatnonzero(~finite)[0])
-                raise InputError(f"{name}: row {row} is {values[row]}; allowed: finite numbers")
+        for name, values in (("position [m]", position), ("velocity [m/s]", velocity)):
+            finite_numbers(name, values, (len(position), 3))
 
     def save_state(self) -> State:
         """A copy of the state; the lists are built anew at the next step.
@@ -410,6 +406,7 @@ class Simulation:
 
     @gravity.setter
     def gravity(self, gravity: tuple[float, float, float]) -> None:
+        finite_numbers("gravity [m/s^2]", gravity, (3,))
         self.blood.gravity = gravity
 
     @property
@@ -445,19 +442,4 @@ class Simulation:
     def diagnostics(self) -> Diagnostics:
         """Figures of the present state; leaks are counted against the surface itself."""
         self._require_runtime()
-        counts = self.outlets.outflow_counts()
-        names = [o.name for o in self.vessel.openings]
-        left = counts[2:]
-        drained = {name: int(n) for name, n in zip(names, left, strict=False)}
-        density = self.particles.in_order(self.particles.density)
-        x = self.positions()
-        held = np.ones(len(x), bool)
-        for wound in self.wounds:
-            # Blood in the hole has not leaked.
-            held &= wound.distance(x) > wound.radius + 3.0 * self.scene.discretization.spacing
-        widened = self.wall.displacement_factor * self.wall.largest_amplitude
-        leaks = self.vessel.count_leaks(x[held], widened) + int(counts[OUT_OF_BOX])
-        return diagnose(
-            self, density, drained, leaks, added=self.inflow.added,
-            bled=int(left[len(names) :].sum()), sucked=int(counts[SUCTION]),
-        )  # fmt: skip
+        return diagnose_vessel(self)

@@ -19,10 +19,38 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from taichi_sph.errors import InputError
 from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall
+
+
+def finite_numbers(name: str, values: Any, shape: tuple[int, ...] = ()) -> np.ndarray:
+    """What a user gave, as numbers of double precision.
+
+    Args:
+        name: of what was given, for the sentence.
+        values: a number, or numbers.
+        shape: that is wanted.
+
+    Raises:
+        InputError: they are no numbers, not finite, or of another shape.
+    """
+    try:
+        numbers = np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {values!r} is no number; allowed: finite numbers") from None
+    if numbers.shape != shape:
+        wanted = f"an array of shape {shape}" if shape else "one number"
+        raise InputError(f"{name}: found an array of shape {numbers.shape}; allowed: {wanted}")
+    if not np.isfinite(numbers).all():
+        row = np.argwhere(~np.isfinite(numbers))[0]
+        where = f" in row {row[0]}" if len(shape) > 1 else ""
+        raise InputError(f"{name}: found {numbers[tuple(row)]}{where}; allowed: finite numbers")
+    return numbers
 
 
 @dataclass(eq=False)

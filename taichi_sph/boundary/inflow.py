@@ -35,7 +35,7 @@ import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
-from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.boundary import BloodFlow, Boundary, finite_numbers
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.geometry.mesh import Floats, Integers
@@ -251,8 +251,9 @@ class BufferZones(Boundary):
         """Multiply what drives an opening, or all, by a factor; it takes RAMP_TIME to get there.
 
         Raises:
-            InputError: nothing drives that opening.
+            InputError: nothing drives that opening, or the factor is not finite.
         """
+        finite_numbers("inflow: factor", factor)
         chosen = [o for o in self.openings if opening in (None, o.opening.name)]
         if not chosen:
             names = ", ".join(o.opening.name for o in self.openings) or "none"
@@ -339,7 +340,16 @@ class BufferZones(Boundary):
         }
 
     def load_state(self, saved: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Go on from a saved state.
+
+        Raises:
+            InputError: it is of another number of driven openings.
+        """
+        if len(saved["openings"]) != len(self.openings):
+            raise InputError(
+                f"a state of {len(saved['openings'])} driven openings: the scene has "
+                f"{len(self.openings)}"
+            )
         self.added, self.next_identity = saved["added"], saved["next_identity"]
         for driven, row in zip(self.openings, saved["openings"], strict=True):
             driven.load_state(row)

@@ -4,7 +4,7 @@ from typing import Any
 
 import taichi as ti
 
-from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.boundary import BloodFlow, Boundary, finite_numbers
 from taichi_sph.boundary.outlets import SUCTION, Outlets
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.fluid.model import AccelerationModel
@@ -31,7 +31,13 @@ class Suction(Boundary):
         """Time up to which the backlog is worked out [s]."""
 
     def set(self, rate: float, radius: float | None = None) -> None:
-        """Take at most `rate` [m^3/s] of the blood within a radius [m]; two spacings without."""
+        """Take at most `rate` [m^3/s] of the blood within a radius [m]; two spacings without.
+
+        Raises:
+            InputError: a number is not finite.
+        """
+        finite_numbers("suction: rate [m^3/s]", rate)
+        finite_numbers("suction: radius [m]", radius or 0.0)
         self.rate = rate
         self.radius = radius or 2.0 * self.spacing
 

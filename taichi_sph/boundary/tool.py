@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.boundary import BloodFlow, Boundary, finite_numbers
 from taichi_sph.boundary.tool_surface import ToolSurface
+from taichi_sph.errors import InputError
 from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.fluid.wcsph import force_on_tool
 from taichi_sph.geometry.mesh import Floats
@@ -50,10 +51,18 @@ class Tool(Boundary):
         self.write_proxies()
 
     def move_to(self, position: Floats, rotation: Floats | None = None) -> None:
-        """Set the target: a position [m] and, unless it stays, a quaternion w, x, y, z."""
-        self.target_position = np.asarray(position, float)
+        """Set the target: a position [m] and, unless it stays, a quaternion w, x, y, z.
+
+        Raises:
+            InputError: a number is not finite, or the quaternion has no length.
+        """
+        target = finite_numbers("tool: position [m]", position, (3,))
         if rotation is not None:
-            self.target_rotation = Rotation.from_quat(np.roll(rotation, -1))
+            quaternion = finite_numbers("tool: rotation", rotation, (4,))
+            if not quaternion.any():
+                raise InputError("tool: a quaternion of length 0 is no rotation")
+            self.target_rotation = Rotation.from_quat(np.roll(quaternion, -1))
+        self.target_position = target
 
     def take_force(self) -> Floats:
         """Force of the blood on the tool, mean since this was last asked [N], (3,)."""

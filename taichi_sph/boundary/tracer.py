@@ -97,9 +97,8 @@ class Tracer(Boundary):
         )
 
     def reset(self) -> None:
-        """Take all dye away."""
+        """No dye comes in; the blood that has been put back has none."""
         self._inlet[:] = UNTOUCHED
-        self.dye.fill(0.0)
 
     def save_state(self) -> dict[str, Any]:
         """Concentrations of what comes in; the particles' own are saved with them."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.boundary import BloodFlow, Boundary, finite_numbers
 from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Booleans, Floats, plane_axes
@@ -121,8 +121,11 @@ class Wounds(Boundary):
             end: the other end of a cut, likewise [m].
 
         Raises:
-            InputError: not at the wall, too small to bleed, or one wound too many.
+            InputError: not at the wall, too small to bleed, one wound too many, or no number.
         """
+        finite_numbers("wound: radius [m]", radius)
+        for name, point in (("centre", centre), ("end", centre if end is None else end)):
+            finite_numbers(f"wound: {name} [m]", point, (3,))
         if len(self._wounds) >= MOST_WOUNDS:
             raise InputError(f"wound: a session has at most {MOST_WOUNDS}")
         least = LEAST_RADIUS * self.spacing

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from taichi_sph.particles.grid import Points
 from taichi_sph.particles.smoothing_kernel import WendlandC2
+from taichi_sph.runtime import runtime_number
 
 
 class Proxies(NamedTuple):
@@ -96,7 +97,11 @@ class Wall:
 
         `period` [m] repeats the wall along the axes where it is not zero; there is room for the
         proxies of a tool.  `amplitude` [m], (m,), is how far each moves along its normal.
+
+        Raises:
+            RunError: Taichi was not started, or in another process or thread.
         """
+        runtime_number()
         m = len(position)
         rows = max(m + tool, 1)
         volume = proxy_volumes(position, kernel, period) if m else np.zeros(0)

@@ -1,4 +1,6 @@
 import re
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,8 @@ from builders import (
     plane,
 )
 from reference import separations
-from taichi_sph.errors import RunError
+from taichi_sph.boundary.boundary import Boundary
+from taichi_sph.errors import InputError, RunError
 from taichi_sph.fluid.rheology import Casson, Newtonian
 from taichi_sph.simulation import Simulation
 
@@ -105,6 +108,117 @@ def test_advancing_to_the_present_takes_no_step():
     steps = sim.steps
     sim.advance_to(1e-3)
     assert sim.steps == steps
+
+
+@pytest.mark.parametrize("time", [0.5e-3, 0.0, -1.0, np.nan, np.inf, "soon", None, [2e-3, 3e-3]])
+def test_a_time_that_is_past_or_none_is_refused_and_the_clock_stays(time):
+    sim = stirred()
+    sim.advance_to(1e-3)
+    steps = sim.steps
+    with pytest.raises(InputError, match=r"^advance_to: .*; allowed: ") as error:
+        sim.advance_to(time)
+    assert "\n" not in str(error.value)
+    assert (sim.time, sim.steps) == (1e-3, steps)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.full((3, 3), np.nan), np.full((3, 3), -np.inf), np.zeros((3, 2)), np.zeros(3), "here"],
+    ids=["nan", "infinite", "plane", "flat", "word"],
+)
+@pytest.mark.parametrize("which", [0, 1], ids=["position", "velocity"])
+def test_blood_that_is_no_numbers_is_refused_and_what_is_there_stays(wrong, which):
+    sim = stirred()
+    before = state(sim)
+    given = [np.full((3, 3), 1e-3), np.zeros((3, 3))]
+    given[which] = wrong
+    for call in (sim.restart_with, lambda x, v: sim.set_blood(np.arange(3), x, v)):
+        with pytest.raises(InputError, match=r"^(position|velocity) \[m.*; allowed: "):
+            call(*given)
+    for one, other in zip(state(sim), before, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_gravity_is_three_finite_numbers():
+    sim = stirred()
+    wrongs: tuple[Any, ...] = ((0.0, np.nan, 0.0), (0.0, 0.0), -9.81)
+    for wrong in wrongs:
+        with pytest.raises(InputError, match=r"^gravity \[m/s\^2\]: found "):
+            sim.gravity = wrong
+    assert sim.gravity == GRAVITY
+
+
+class Moments(Boundary):
+    """A boundary that writes down when it is asked, and for what."""
+
+    name = "moments"
+
+    def __init__(self, reach: float = 0.0):
+        self.asked: list[str] = []
+        self.reach = reach
+
+    def before_lists(self) -> None:
+        self.asked.append("before_lists")
+
+    def before_drift(self, dt, model) -> float:
+        self.asked.append("before_drift")
+        return self.reach
+
+    def compile_kernels(self, model) -> None:
+        self.asked.append("compile_kernels")
+
+    def reset(self) -> None:
+        self.asked.append("reset")
+
+    def save_state(self) -> dict:
+        return {"asked": list(self.asked)}
+
+    def load_state(self, saved) -> None:
+        self.asked = list(saved["asked"])
+
+
+def test_boundaries_are_asked_at_their_moments():
+    moments = Moments()
+    sim = stirred(boundaries=(moments,))
+    sim.step(1e-5)
+    sim.step(1e-5)
+    assert moments.asked == ["before_lists", "before_drift", "before_drift"]
+    kept = sim.save_state()
+    assert kept.boundaries == {"moments": {"asked": moments.asked}}
+    # A copy has the lists built anew, so that who goes on from it sums alike.
+    sim.step(1e-5)
+    assert moments.asked[3:] == ["before_lists", "before_drift"]
+    x, v = pool()
+    sim.restart_with(x, v)
+    assert moments.asked[5:] == ["reset"]
+    sim.compile_kernels([sim.model])
+    assert moments.asked[6:] == ["compile_kernels"]
+    sim.load_state(kept)
+    assert moments.asked == kept.boundaries["moments"]["asked"]
+    # A state that is older than a boundary leaves it as at the start; one of another is refused.
+    sim.load_state(replace(kept, boundaries={}))
+    assert moments.asked[3:] == ["reset"]
+    with pytest.raises(InputError, match="with wings that the scene has not"):
+        sim.load_state(replace(kept, boundaries={"wings": {}}))
+
+
+def test_what_boundaries_move_makes_the_lists_stale():
+    near, far = Moments(0.3 * SKIN), Moments(0.8 * SKIN)
+    sim = stirred(boundaries=(near,))
+    for _ in range(3):
+        sim.step(1e-7)
+    assert near.asked.count("before_lists") == 1
+    sim = stirred(boundaries=(near, far))
+    sim.step(1e-7)
+    assert sim.neighbors.stale
+
+
+def test_a_simulation_of_parts_has_no_scene_and_says_so():
+    sim = stirred()
+    for ask in ("scene", "vessel", "fluid", "inflow", "wounds"):
+        with pytest.raises(LookupError, match=r"^this simulation "):
+            getattr(sim, ask)
+    assert sim.wall_motion is None
 
 
 def test_a_simulation_without_blood_reaches_its_time():

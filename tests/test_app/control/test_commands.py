@@ -227,3 +227,17 @@ def test_without_driven_openings_there_is_no_inflow(session: Session) -> None:
 def test_a_dye_that_says_not_where_is_refused_at_once(session, keys, says) -> None:
     with pytest.raises(InputError, match=says):
         session.submit({"command": "dye", **keys}, "test")
+
+
+def test_a_dye_marks_the_blood_that_it_names(session: Session) -> None:
+    simulation = session.simulation
+    session.submit(as_dict(EXAMPLES[Dye]), "test")
+    session.before_step()
+    rows = simulation.particles.rows()
+    away = np.linalg.norm(rows["position"] - (0.0, 0.0, 0.005), axis=1)
+    marked = away < 0.004
+    assert marked.any() and not marked.all()
+    np.testing.assert_array_equal(rows["dye"], np.where(marked, np.float32(0.5), 0.0))
+    session.submit({"command": "reset"}, "test")
+    session.before_step()
+    assert not simulation.particles.rows()["dye"].any()

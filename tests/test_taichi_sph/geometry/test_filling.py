@@ -1,89 +1,65 @@
-"""Blood at the start."""
+"""Blood at the start, in a lumen that is given by its equations."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from meshes import (
-    bent,
-)
-from places import VESSELS
-from taichi_sph.geometry import mesh
-from taichi_sph.geometry.caps import find_caps
-from taichi_sph.geometry.findings import check_vessel
-from taichi_sph.geometry.vessel import Vessel, build_vessel, read_vessel
-from taichi_sph.scene import Column, OpeningTable, read_scene
+from taichi_sph.geometry.filling import fill_column
+from taichi_sph.geometry.openings import Opening
+from taichi_sph.scene import Column
 
-SCENES = sorted(path.relative_to(VESSELS).as_posix() for path in VESSELS.glob("*/scene.toml"))
+HALF, DEPTH, FOOT = 5.0, 10.0, 2.0
+"""A box [spacings], |x| and |y| up to HALF, z down to -DEPTH; FOOT of it below a wall at x = 0."""
 
 
-def test_a_box_is_filled_to_the_last_place() -> None:
-    scene = read_scene(VESSELS / "box" / "scene.toml")
-    vessel = read_vessel(scene)
-    blood = vessel.fill_column(scene.column, 1e-3)
-    assert len(blood) == 16 * 16 * 20
-    assert blood.min(axis=0) == pytest.approx([-7.5e-3, -7.5e-3, -19.5e-3], abs=1e-8)
-    assert blood.max(axis=0) == pytest.approx([7.5e-3, 7.5e-3, -0.5e-3], abs=1e-8)
+@dataclass
+class Hairpin:
+    """Two square legs with a wall of some thickness between them, joined at their foot."""
+
+    thickness: float
+    """Of the wall between the legs [spacings]."""
+
+    @property
+    def bounds(self):
+        return np.array([-HALF, -HALF, -DEPTH]), np.array([HALF, HALF, 0.0])
+
+    @property
+    def vertices(self):
+        low, high = self.bounds
+        return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+
+    @property
+    def volume(self):
+        return 4.0 * HALF**2 * DEPTH
+
+    def _beyond_wall(self, points):
+        """Distance to the wall between the legs; negative within it."""
+        x, _, z = points.T
+        aside, below = np.abs(x) - 0.5 * self.thickness, (FOOT - DEPTH) - z
+        outside = np.hypot(np.maximum(aside, 0.0), np.maximum(below, 0.0))
+        return np.where((aside < 0.0) & (below < 0.0), np.maximum(aside, below), outside)
+
+    def contains(self, points):
+        low, high = self.bounds
+        return ((points > low) & (points < high)).all(axis=1) & (self._beyond_wall(points) > 0.0)
+
+    def distance(self, points):
+        low, high = self.bounds
+        to_box = np.abs(np.concatenate([points - low, high - points], axis=1)).min(axis=1)
+        return np.minimum(to_box, np.abs(self._beyond_wall(points)))
 
 
-@pytest.mark.parametrize("wanted", [500, 1234])
-def test_the_column_has_the_number_asked_for(aorta: Vessel, wanted: int) -> None:
-    spacing = 0.9e-3
-    column = Column(opening="inlet_abdominal_aorta", particles=wanted)
-    blood = aorta.fill_column(column, spacing)
-    assert len(blood) == wanted
-    assert len(np.unique(np.round(blood / spacing * 100), axis=0)) == wanted
-    assert aorta.signed_distance(blood).max() <= -0.499 * spacing
-    opening = aorta.openings[0]
-    depth = (opening.centre - blood) @ opening.normal
-    assert depth.min() == pytest.approx(0.5 * spacing)
-    # As shallow as can be: it fills all layers but its last.
-    full = aorta.fill_column(
-        Column(opening="inlet_abdominal_aorta", height=depth.max() - 0.4 * spacing), spacing
-    )
-    assert len(full) <= wanted
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_shipped_scenes_fill_strictly_inside_and_leak_nothing(name: str) -> None:
-    scene = read_scene(VESSELS / name)
-    vessel = read_vessel(scene)
-    spacing = scene.discretization.spacing
-    blood = vessel.fill_column(scene.column, spacing)
-    assert 3000 <= len(blood) <= 6000
-    assert vessel.signed_distance(blood).max() <= -0.498 * spacing
-    assert vessel.count_leaks(blood) == 0
-    assert vessel.narrowest / spacing > 6.0
-    # The column stands below its opening: gravity points into the lumen there.
-    opening = vessel.opening(scene.column.opening)
-    gravity = np.array(scene.gravity)
-    assert gravity @ opening.normal < -0.5 * np.linalg.norm(gravity)
-    assert all(finding.good for finding in check_vessel(vessel))
-
-
-@pytest.mark.parametrize("name", ["aortoiliac/A.toml", "portal_vein/B.toml"])
-def test_scenes_of_the_papers_sizes_hold_16_000_and_32_000(name: str) -> None:
-    scene = read_scene(VESSELS / name)
-    vessel = read_vessel(scene)
-    spacing, column = scene.discretization.spacing, scene.column
-    assert column.particles == 16_000
-    proxies = vessel.wall_area / (spacing * scene.discretization.wall_spacing_ratio) ** 2
-    assert proxies == pytest.approx(56_000 if "A" in name else 73_000, rel=0.02)
-    twice = vessel.fill_column(Column(opening=column.opening, particles=32_000), spacing)
-    assert len(twice) == 32_000
-
-
-def test_a_column_stays_in_the_leg_of_its_opening() -> None:
-    vertices, faces = bent()
-    ends = [
-        mesh.region_plane(vertices, faces[cap.faces])[0]
-        for cap in find_caps(vertices, faces, "bend")
-    ]
-    left, right = sorted(ends, key=lambda centre: centre[0])
-    openings = {
-        name: OpeningTable(centre=tuple(centre)) for name, centre in (("a", left), ("b", right))
-    }
-    vessel = build_vessel(vertices, faces, openings, 1.0, "bend")
-    blood = vessel.fill_column(Column(opening="a", height=0.004), 1e-3)
-    assert blood[:, 0].max() < 0  # not in the other leg, though it is as deep there
-    both = vessel.fill_column(Column(opening="a", particles=1800), 1e-3)
-    assert both[:, 0].max() > 0  # round the bend
+@pytest.mark.parametrize("thickness", [1e-3, 0.1, 1.0])
+def test_a_column_stays_in_its_leg_however_thin_the_wall_beside_it_is(thickness: float) -> None:
+    edge = -0.5 * thickness
+    rim = np.array([[-HALF, -HALF, 0.0], [edge, -HALF, 0.0], [edge, HALF, 0.0], [-HALF, HALF, 0.0]])
+    area = (HALF + edge) * 2.0 * HALF
+    centre, up = np.array([0.5 * (edge - HALF), 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    opening = Opening("leg", centre, up, np.sqrt(area / np.pi), area, True)
+    blood = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", height=5.0), 1.0)
+    assert (blood[:, 0] < edge).all()
+    # 5 layers of 10 by 5 places, or by 4 where the wall takes one.
+    assert len(blood) == 5 * 10 * (5 if thickness < 0.01 else 4)
+    whole = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", full=True), 1.0)
+    assert (whole[:, 0] > -edge).any(), "round the foot it goes"
