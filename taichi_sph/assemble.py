@@ -21,7 +21,7 @@ from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.boundary.suction import Suction
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.boundary.tool_surface import ToolSurface, read_tool_surface
-from taichi_sph.boundary.tracer import DYE, Tracer
+from taichi_sph.boundary.tracer import AGE, DYE, Tracer
 from taichi_sph.boundary.wall_motion import MovingWall, WallMotion, read_wall_motion
 from taichi_sph.boundary.wounds import MOST_WOUNDS, Wounds
 from taichi_sph.derived import Derived, derive
@@ -150,7 +150,7 @@ def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
     fluid = _make_fluid(plan, derived)
     particles = Particles.from_numpy(
         initial, mass=scene.blood.density * plan.spacing**3, room=_room(plan, len(initial)),
-        more=(DYE,),
+        more=(DYE, AGE),
     )  # fmt: skip
     wall = Wall.from_numpy(
         start.proxies, start.normals, plan.kernel, start.setback, plan.wall_spacing,
@@ -317,7 +317,7 @@ def _make_boundaries(plan: _Plan, blood: BloodFlow) -> tuple[Boundary, ...]:
         tool,
         Suction(blood, outlets, tool, spacing),
         inflow,
-        Tracer(blood, inflow),
+        Tracer(blood, inflow, outlets),
         Wounds(blood, vessel, outlets, len(vessel.openings), plan.kernel, spacing),
     ]  # fmt: skip
     if plan.motion is not None:

@@ -1,11 +1,12 @@
 """Diagnostics: what a frame says about the state of the blood, and why a run had to stop."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION
+from taichi_sph.boundary.tracer import Tracer
 
 FEW = 0.2
 """Part of the blood below which its centre of mass says little."""
@@ -45,6 +46,8 @@ class Diagnostics:
     """Volume that has left through wounds [m^3]."""
     sucked_volume: float = 0.0
     """Volume that was aspirated [m^3]."""
+    mean_age: dict[str, float] = field(default_factory=dict)
+    """Mean age of all that has left [s], by opening that something has left by."""
 
 
 def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]:
@@ -63,6 +66,7 @@ def diagnose(
     added: int = 0,
     bled: int = 0,
     sucked: int = 0,
+    mean_age: dict[str, float] | None = None,
 ) -> Diagnostics:
     """Diagnostics of a simulation, ours or one that is read as ours is.
 
@@ -74,6 +78,7 @@ def diagnose(
         added: particles that were driven in.
         bled: particles that have left through wounds.
         sucked: particles that were aspirated.
+        mean_age: of what has left [s], by opening.
     """
     volume = simulation.particles.mass / simulation.scene.blood.density
     rest_density = simulation.scene.blood.density
@@ -96,6 +101,7 @@ def diagnose(
         kinetic_energy=float(0.5 * simulation.particles.mass * speed2.sum()),
         max_speed=float(np.sqrt(speed2.max(initial=0.0))),
         fallback_share=simulation.fallback_share,
+        mean_age=mean_age or {},
     )
 
 
@@ -105,6 +111,8 @@ def diagnose_vessel(simulation: Any) -> Diagnostics:
     names = [o.name for o in simulation.vessel.openings]
     left = counts[2:]
     drained = {name: int(n) for name, n in zip(names, left, strict=False)}
+    ages = simulation.boundary(Tracer).mean_age()[2:]
+    mean_age = {name: float(ages[k]) for k, name in enumerate(names) if left[k] > 0}
     density = simulation.particles.in_order(simulation.particles.density)
     x = simulation.positions()
     held = np.ones(len(x), bool)
@@ -116,6 +124,7 @@ def diagnose_vessel(simulation: Any) -> Diagnostics:
     return diagnose(
         simulation, density, drained, leaks, added=simulation.inflow.added,
         bled=int(left[len(names) :].sum()), sucked=int(counts[SUCTION]),
+        mean_age=mean_age,
     )  # fmt: skip
 
 

@@ -64,6 +64,13 @@ scheduler = click.option(
     metavar="dask:ADDRESS",
     help="Scheduler of a Dask cluster that does the work.  [default: this machine does]",
 )
+colour = click.option(
+    "--colour",
+    type=click.Choice(["speed", "age"]),
+    default="speed",
+    show_default=True,
+    help="What the recording and the live view colour blood by; dye is seen in both.",
+)
 weights = click.option(
     "--weights",
     type=output_path,

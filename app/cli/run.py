@@ -56,6 +56,7 @@ outputs = options.together(
         show_default=True,
         help="Show the particles of every N-th frame; plots have all frames.",
     ),
+    options.colour,
     click.option("--summary", type=output_path, metavar="FILE", help="Write the summary as JSON."),
 )
 model = options.together(
@@ -153,8 +154,9 @@ def run(**given: Any) -> int:
     metavar="FILE",
     help="Record to a Rerun file; a recording that is there is replaced.",
 )
+@options.colour
 @options.threads
-def replay(session: Path, rrd: Path | None, threads: int | None) -> int:
+def replay(session: Path, rrd: Path | None, colour: str, threads: int | None) -> int:
     """Run a session again from its log, and compare the blood bit by bit, frame by frame."""
     from app.control.replay import replay as replay_session
     from app.files import check_output
@@ -163,7 +165,7 @@ def replay(session: Path, rrd: Path | None, threads: int | None) -> int:
     if rrd is not None:
         check_output(rrd, "--rrd", b"RRF2")
     with claimed(rrd, "--rrd"):
-        result = replay_session(session, rrd, threads)
+        result = replay_session(session, rrd, threads, colour)
     if result.first_difference is not None:
         raise RunError(f"replay {session}: differs from frame {result.first_difference} on")
     commands = len(result.log.entries)

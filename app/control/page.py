@@ -21,7 +21,7 @@ from app.control.commands import Command, as_dict
 from app.control.page_controls import ML, ML_MIN, Panel, add_controls
 from app.control.page_scene import PageScene
 from app.control.ports import is_loopback
-from app.view.appearance import SPEED_COLOURS
+from app.view.appearance import COLOURINGS, Colouring, colouring
 from taichi_sph.errors import InputError
 
 if TYPE_CHECKING:
@@ -107,14 +107,14 @@ def status_table(status: dict[str, Any]) -> str:
     )
 
 
-def colour_bar(full_scale: float) -> str:
-    """What colours mean, as HTML; `full_scale` [m/s] is brightest."""
-    colours = ",".join(f"rgb{colour}" for colour in SPEED_COLOURS)
+def colour_bar(colour: Colouring) -> str:
+    """What colours mean, as HTML."""
+    colours = ",".join(f"rgb{anchor}" for anchor in colour.anchors)
     return (
         f"<div style='margin:.4em .9em;height:.7em;background:linear-gradient(90deg,{colours})'>"
         "</div><div style='display:flex;justify-content:space-between;margin:0 .9em;"
-        f"font-size:.75em;opacity:.75'><span>at rest</span><span>{full_scale:.2g} m/s and above"
-        "</span></div>"
+        f"font-size:.75em;opacity:.75'><span>{colour.at_zero}</span>"
+        f"<span>{colour.full_scale:.2g} {colour.unit} and above</span></div>"
     )
 
 
@@ -158,7 +158,7 @@ class ControlPage:
         self._session = session
         self._pending: queue.SimpleQueue[_Pending] = queue.SimpleQueue()
         self._refusals: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._closing = threading.Event()
+        self._closing, self._recolour = threading.Event(), threading.Event()
         self.frames_shown = 0
         self._shown: ViewFrame | None = None
         self._dragged: set[int] = set()
@@ -216,9 +216,22 @@ class ControlPage:
         gui.set_panel_label(self._session.simulation.scene.title)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
-        gui.add_html(colour_bar(self._scene.full_scale))
+        self._add_colours(gui)
         self._status = gui.add_html("")
         add_controls(Panel(gui, self._session, self._scene, self._wish))
+
+    def _add_colours(self, gui: Any) -> None:
+        """Choice of what colours mean, for all who look on; the run does not know of it."""
+        simulation = self._session.simulation
+        bar = gui.add_html(colour_bar(self._scene.colouring))
+        choice = gui.add_dropdown("colour", COLOURINGS)
+
+        @choice.on_update
+        async def _(event: Any) -> None:
+            chosen = colouring(choice.value, simulation.scene, simulation.derived)
+            self._scene.colouring, bar.content = chosen, colour_bar(chosen)
+            # The next frame may be long in coming.
+            self._recolour.set()
 
     def _wish(self, control: Any, command: Callable[[], Command]) -> None:
         """Have a control ask for a command."""
@@ -293,7 +306,8 @@ class ControlPage:
         return settle
 
     def _show(self, frame: "ViewFrame") -> None:
-        if frame is not self._shown:
+        if frame is not self._shown or self._recolour.is_set():
+            self._recolour.clear()
             self._shown = frame
             self.frames_shown += 1
             with self._server.atomic():

@@ -13,7 +13,7 @@ from app.view.appearance import (
     TOOL_COLOUR,
     WALL_COLOUR,
     WOUND_COLOUR,
-    blood_colours,
+    colouring,
     eye,
     upward,
 )
@@ -55,8 +55,8 @@ class PageScene:
         self._simulation = simulation
         self._tool = simulation.tool
         self._spacing = simulation.scene.discretization.spacing
-        self.full_scale = simulation.derived.expected_speed or 1.0
-        """Speed of the brightest colour [m/s]."""
+        self.colouring = colouring("speed", simulation.scene, simulation.derived)
+        """What the colour of blood means."""
         self._wounds: dict[int, Wound] = {}
         self._rims: list[Any] = []
         self.on_wounds: Callable[[list[int]], None] = lambda numbers: None
@@ -169,7 +169,7 @@ class PageScene:
 
     def show_blood(self, frame: "ViewFrame") -> None:
         """Show another frame."""
-        colours = blood_colours(frame.velocities, self.full_scale, frame.dye)
+        colours = self.colouring.colours(frame.velocities, frame.age, frame.dye)
         self._blood.points, self._blood.colors = frame.positions, colours
         if len(frame.droplets) or len(self._droplets.points):
             self._droplets.points = frame.droplets

@@ -103,8 +103,10 @@ def logged_run(path: Path, log: SessionLog) -> tuple[Scene, Path | None, dict[st
     return scene, weights, run
 
 
-def replay(path: Path, rrd: Path | None, threads: int | None) -> ReplayResult:
-    """Make the run of a log again, and a recording of it if asked for.
+def replay(
+    path: Path, rrd: Path | None, threads: int | None, colour: str = "speed"
+) -> ReplayResult:
+    """Make the run of a log again, and a recording of it, coloured so, if asked for.
 
     Raises:
         InputError: it is no log, or what it needs is not there as it was.
@@ -128,7 +130,7 @@ def replay(path: Path, rrd: Path | None, threads: int | None) -> ReplayResult:
     if rrd is not None:
         from app.view.rerun_view import RerunView
 
-        view = RerunView(simulation, rrd)
+        view = RerunView(simulation, rrd, colour=colour)
         session.on_applied.append(view.note)
         observers.append(view)
     until = max(log.digests) * scene.frame_interval

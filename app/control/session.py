@@ -60,6 +60,8 @@ class ViewFrame:
     """Blood that has left through wounds [m], (m, 3)."""
     dye: np.ndarray
     """Concentration of the dye [-], (n,)."""
+    age: np.ndarray
+    """Time in the vessel [s], (n,)."""
 
 
 class _Waiting(NamedTuple):
@@ -222,9 +224,10 @@ class Session:
     def _take_frame(self) -> None:
         simulation = self.simulation
         _, position, velocity = simulation.particles.live()
+        tracer, n = simulation.boundary(Tracer), len(position)
         self._latest_frame = ViewFrame(
             simulation.time, position, velocity, simulation.outlets.droplets(),
-            simulation.boundary(Tracer).dye.to_numpy()[: len(position)],
+            tracer.dye.to_numpy()[:n], tracer.age.to_numpy()[:n],
         )  # fmt: skip
         self._viewed, self.frame_requested = clock.perf_counter(), False
 
@@ -310,6 +313,7 @@ class Session:
             "lost": bled,
             "suctioned": diagnostics.sucked_volume,
             "added": diagnostics.added_volume,
+            "mean_age": diagnostics.mean_age,
             "compression": diagnostics.compression_p99,
             "guard_share": self.models.fallback_fraction(diagnostics),
             "model": self.models.selected,

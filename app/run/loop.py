@@ -69,6 +69,8 @@ class Summary:
     """[m^3]"""
     drained: dict[str, int]
     """Particles that have left, by opening."""
+    mean_age: dict[str, float]
+    """Mean time that those have been in the vessel [s], by opening that something has left by."""
     added_volume: float
     """Blood that pumps and reservoirs have added [m^3]."""
     fallback_share: float
@@ -256,6 +258,7 @@ def _summary_of(
         particles=figures.particles,
         drained_volume=figures.drained_volume,
         drained=figures.drained,
+        mean_age=figures.mean_age,
         added_volume=figures.added_volume,
         fallback_share=figures.fallback_share,
         **counted,

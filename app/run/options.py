@@ -36,6 +36,8 @@ class RunOptions:
     """Loopback port of a live view."""
     every: int = 1
     """Particles are shown in each so many frames."""
+    colour: str = "speed"
+    """What blood is coloured by, one of `app.view.appearance.COLOURINGS`."""
     summary: Path | None = None
     """JSON file for the summary."""
     particles: int | None = None
@@ -69,6 +71,8 @@ class RunOptions:
             (self.particles is not None and self.height is not None,
              "--particles and --height: give one of the two"),
             (self.every > 1 and not shown, "--every: nothing is shown without --rrd or --live"),
+            (self.colour != "speed" and not shown,
+             "--colour: nothing is shown without --rrd or --live; the page has its own choice"),
             (self.weights is not None and self.model != "pcnet" and not self.is_acted_on,
              "--weights: only --model pcnet has weights"),
             (auto and (self.resume is not None or self.checkpoint is not None),

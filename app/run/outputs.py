@@ -71,8 +71,9 @@ def _view(
 
     properties = {key: facts[key] for key in ("arch", "precision", "seed", "version")}
     view = RerunView(
-        simulation, options.rrd, options.live, options.every, properties, options.checkpoint
-    )
+        simulation, options.rrd, options.live, options.every, properties, options.checkpoint,
+        options.colour,
+    )  # fmt: skip
     if view.live:
         print(f"live view: rerun --connect {view.live.url}", file=sys.stderr)
     return view
@@ -197,6 +198,9 @@ def summary_text(summary: Summary) -> str:
     if len(s.drained) > 1:
         by_opening = ", ".join(f"{name} {count}" for name, count in s.drained.items())
         lines.insert(4, f"  particles drained: {by_opening}")
+    if s.mean_age:
+        by_opening = ", ".join(f"{name} {age:.3g} s" for name, age in s.mean_age.items())
+        lines.append(f"  mean time in the vessel of what left: {by_opening}")
     if s.fallback_share:
         lines.append(f"  the physics took over for {1e2 * s.fallback_share:.2g} % of the time")
     return "\n".join(lines)

@@ -1,9 +1,16 @@
-"""How a picture of the blood looks: colours of speed and where the eye stands."""
+"""How a picture of the blood looks: colours of speed, age and dye, and where the eye stands."""
 
+import functools
 import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from taichi_sph.derived import Derived
+    from taichi_sph.scene import Scene
 
 Floats = NDArray[np.float64]
 
@@ -21,11 +28,24 @@ SPEED_COLOURS = (
 """Dark red at rest to pale yellow, (red, green, blue) at even steps; a test holds that the CIE
 lightness rises evenly, so that equal differences of speed look equal."""
 
+AGE_COLOURS = (
+    (0x44, 0x01, 0x54),
+    (0x47, 0x2D, 0x7B),
+    (0x3B, 0x52, 0x8B),
+    (0x2C, 0x72, 0x8E),
+    (0x21, 0x91, 0x8C),
+    (0x28, 0xAE, 0x80),
+    (0x5E, 0xC9, 0x62),
+    (0xAD, 0xDC, 0x30),
+    (0xFD, 0xE7, 0x25),
+)
+"""Violet when it comes in to yellow: viridis, by Smith and van der Walt 2015 (CC0)."""
+
 WALL_COLOUR = (0xE0, 0x98, 0x90, 0x2A)
 TOOL_COLOUR = (0xC8, 0xD2, 0xDC, 0xFF)
 DROP_COLOUR = (0x96, 0x14, 0x14)
 DYE_COLOUR = (0x1E, 0xC8, 0xF0)
-"""Cyan: no speed has it."""
+"""Cyan: no speed and no age has it."""
 WOUND_COLOUR = (0xFF, 0xE0, 0x60, 0xFF)
 """Red, green, blue, opacity."""
 BACKGROUND = (14, 16, 20)
@@ -37,44 +57,66 @@ TILT = math.radians(12.0)
 """The eye looks down a little, which tells near from far."""
 
 
-def _colour_table() -> NDArray[np.uint8]:
-    """Colours of speed from rest to full scale: red, green, blue, shape (256, 3)."""
-    anchors = np.array(SPEED_COLOURS, float)
+@dataclass(frozen=True)
+class Colouring:
+    """What the colour of blood means."""
+
+    of: str
+    """The quantity, one of COLOURINGS."""
+    anchors: tuple[tuple[int, int, int], ...]
+    """Colours from zero to full scale at even steps: red, green, blue."""
+    full_scale: float
+    """Value of the last colour, in SI units."""
+    unit: str
+    at_zero: str
+    """What blood of the first colour is."""
+
+    def colours(
+        self, velocities: NDArray[np.floating], age: NDArray[np.floating],
+        dye: NDArray[np.floating],
+    ) -> NDArray[np.uint8]:  # fmt: skip
+        """Red, green, blue of blood, (n, 3): of its speed or age, towards DYE_COLOUR as it is dyed.
+
+        Args:
+            velocities: [m/s], (n, 3).
+            age: [s], (n,).
+            dye: concentration, 0 to 1, (n,).
+        """
+        values = age if self.of == "age" else np.sqrt(np.einsum("ij,ij->i", velocities, velocities))
+        colours = colour_table(self.anchors)[levels(values, self.full_scale)]
+        if dye.any():
+            part = np.clip(dye, 0.0, 1.0)[:, None]
+            mixed = (1.0 - part) * colours + part * np.array(DYE_COLOUR, float)
+            colours = np.rint(mixed).astype(np.uint8)
+        return colours
+
+
+COLOURINGS = ("speed", "age")
+"""What blood may be coloured by."""
+
+
+def colouring(of: str, scene: "Scene", derived: "Derived") -> Colouring:
+    """The colouring of a scene's blood by one of COLOURINGS."""
+    if of == "age":
+        return Colouring(of, AGE_COLOURS, scene.duration, "s", "new")
+    # Free fall over the whole height, or what drives: little is faster.
+    return Colouring(of, SPEED_COLOURS, derived.expected_speed or 1.0, "m/s", "at rest")
+
+
+@functools.cache
+def colour_table(anchors: tuple[tuple[int, int, int], ...]) -> NDArray[np.uint8]:
+    """Colours from zero to full scale: red, green, blue, shape (256, 3)."""
+    points = np.array(anchors, float)
     at = np.linspace(0.0, 1.0, 256)
-    even = np.linspace(0.0, 1.0, len(anchors))
-    bands = [np.rint(np.interp(at, even, anchors[:, k])) for k in range(3)]
+    even = np.linspace(0.0, 1.0, len(points))
+    bands = [np.rint(np.interp(at, even, points[:, k])) for k in range(3)]
     return np.stack(bands, axis=1).astype(np.uint8)
 
 
-COLOURS = _colour_table()
-PACKED_COLOURS = np.array([int.from_bytes([*colour, 0xFF], "big") for colour in COLOURS], np.uint32)
-"""The same as 0xRRGGBBAA, (256,)."""
-
-
-def speed_levels(velocities: NDArray[np.floating], full_scale: float) -> NDArray[np.uint8]:
-    """Where in the table the speeds of velocities (n, 3) are; `full_scale` [m/s] is its end."""
-    speed = np.sqrt(np.einsum("ij,ij->i", velocities, velocities))
-    last = len(COLOURS) - 1
-    # Not finite, it is shown as the fastest.
-    return np.fmin(speed * (last / full_scale), last).astype(np.uint8)
-
-
-def blood_colours(
-    velocities: NDArray[np.floating], full_scale: float, dye: NDArray[np.floating]
-) -> NDArray[np.uint8]:
-    """Red, green, blue of blood, (n, 3): of its speed, and towards DYE_COLOUR as it is dyed.
-
-    Args:
-        velocities: [m/s], (n, 3).
-        full_scale: speed of the brightest colour [m/s].
-        dye: concentration, 0 to 1, (n,).
-    """
-    colours = COLOURS[speed_levels(velocities, full_scale)]
-    if dye.any():
-        part = np.clip(dye, 0.0, 1.0)[:, None]
-        mixed = (1.0 - part) * colours + part * np.array(DYE_COLOUR, float)
-        colours = np.rint(mixed).astype(np.uint8)
-    return colours
+def levels(values: NDArray[np.floating], full_scale: float) -> NDArray[np.uint8]:
+    """Where in a table values (n,) are, (n,); `full_scale` is its end."""
+    # Not finite, it is shown as the last.
+    return np.fmin(values * (255.0 / full_scale), 255.0).astype(np.uint8)
 
 
 def upward(gravity: tuple[float, float, float]) -> Floats:

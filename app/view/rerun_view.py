@@ -19,13 +19,11 @@ from rerun.blueprint.visualizers import Visualizer
 from app.view.appearance import (
     BACKGROUND,
     DROP_COLOUR,
-    PACKED_COLOURS,
     TOOL_COLOUR,
     WALL_COLOUR,
     WOUND_COLOUR,
-    blood_colours,
+    colouring,
     eye,
-    speed_levels,
     upward,
 )
 from app.view.rerun_streams import (
@@ -123,6 +121,7 @@ class RerunView:
         every: int = 1,
         properties: dict[str, Any] | None = None,
         checkpoint: int | None = None,
+        colour: str = "speed",
     ):
         """Open the file, the live view or both, and show what never changes.
 
@@ -133,6 +132,7 @@ class RerunView:
             every: particles are shown each so many frames; plots have every frame.
             properties: kept with the recording: what program and machine it came from.
             checkpoint: the file has all up to each so many frames when `on_frame` is back.
+            colour: what blood is coloured by, one of `appearance.COLOURINGS`.
 
         Raises:
             InputError: the file cannot be opened, the port is taken, or Rerun is switched off.
@@ -141,8 +141,7 @@ class RerunView:
         self.every, self._checkpoint = every, checkpoint
         self._radius = 0.5 * scene.discretization.spacing
         self._volume = simulation.derived.blood_particles * scene.discretization.spacing**3
-        # Free fall over the whole height: little is faster.
-        self.full_scale = simulation.derived.expected_speed or 1.0
+        self._colouring = colouring(colour, scene, simulation.derived)
         self._last: tuple[int, float] = (-1, 0.0)
         self._notes: Items = []
         self._wounded = self._sucked = False
@@ -237,7 +236,8 @@ class RerunView:
             "spacing": scene.discretization.spacing,
             "support_radius": derived.support_radius,
             "sound_speed": derived.sound_speed,
-            "colour_full_scale": self.full_scale,
+            "colour": self._colouring.of,
+            "colour_full_scale": self._colouring.full_scale,
         }
         stream.send_property("simulation", rr.AnyValues(**(metadata | properties)))
         axes = np.eye(3)
@@ -305,12 +305,13 @@ class RerunView:
             stream.log(f"world/{entity}", style, static=True)
 
     def _document(self, simulation: "Simulation") -> str:
-        scene, derived = simulation.scene, simulation.derived
+        scene, derived, colour = simulation.scene, simulation.derived, self._colouring
         return (
             f"# {scene.title}\n\n"
             f"{derived.blood_particles} blood particles, {derived.proxy_particles} proxy "
-            f"particles on the wall. Colour is speed: dark red at rest, pale yellow at "
-            f"{self.full_scale:.2g} m/s and above.\n\n```toml\n{scene.text}\n```\n"
+            f"particles on the wall. Colour is {colour.of}: dark where blood is {colour.at_zero}, "
+            f"pale at {colour.full_scale:.2g} {colour.unit} and above.\n\n"
+            f"```toml\n{scene.text}\n```\n"
         )
 
     def on_frame(self, simulation: "Simulation", frame: int, diagnostics: "Diagnostics") -> None:
@@ -322,10 +323,8 @@ class RerunView:
         items, self._notes = self._notes, []
         if frame % self.every == 0:
             position, velocity = simulation.positions_and_velocities()
-            dye = simulation.particles.in_order(simulation.boundary(Tracer).dye)
-            colours: Any = PACKED_COLOURS[speed_levels(velocity, self.full_scale)]
-            if dye.any():
-                colours = blood_colours(velocity, self.full_scale, dye)
+            tracer, in_order = simulation.boundary(Tracer), simulation.particles.in_order
+            colours = self._colouring.colours(velocity, in_order(tracer.age), in_order(tracer.dye))
             items.append(("world/blood", rr.Points3D(position, colors=colours)))
             items += self._surgery(simulation)
             if self._wall is not None:

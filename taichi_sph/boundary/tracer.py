@@ -1,7 +1,13 @@
-"""Tracer: a contrast medium, a passive scalar that travels with the blood and acts on nothing.
+"""Tracer: dye and age, passive scalars that travel with the blood and act on nothing.
 
-Each particle has a concentration between 0 and 1, as blood that carries a dye in an angiography.
-It is set within a ball, or for all blood that comes in through a driven opening from now on.
+Dye is a concentration between 0 and 1, as of a contrast medium in an angiography.  It is set within
+a ball, or for all blood that comes in through a driven opening from now on.
+
+Age is the time that blood has been in the vessel: since it came in through a driven opening's
+plane, or since the start for blood that was there.  Its mean over what leaves is the residence
+time, which in a steady flow is V/Q (Danckwerts 1953, doi:10.1016/0009-2509(53)80001-1).  It grows
+when the lists are built, every few steps: it is that much behind.
+
 Particles exchange nothing: diffusion is left out.  Of molecules in water it is some 1e-9 m^2/s
 (Cussler, Diffusion, 2009), less than 0.1 mm in a second, and no scene resolves that.
 """
@@ -13,30 +19,48 @@ import taichi as ti
 
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
 from taichi_sph.boundary.inflow import BufferZones
+from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.errors import InputError
 from taichi_sph.fluid.model import AccelerationModel
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.particles.particles import Quantity
-from taichi_sph.runtime import float_dtype
+from taichi_sph.runtime import float_dtype, has_wide_atomics
 
 DYE = Quantity("dye")
 """Concentration of the dye over that of the medium as injected [-]."""
+AGE = Quantity("age")
+"""Time in the vessel [s]."""
+
+AGE_SCALE = float(1 << 20)
+"""Ages are summed as whole multiples of 1/AGE_SCALE s: the order then does not matter."""
 
 UNTOUCHED = -1.0
 """Concentration of an inflow that nobody has said anything about: blood keeps what it has."""
 
 
 class Tracer(Boundary):
-    """Dye in the blood."""
+    """Dye in the blood, and its age."""
 
     name = "tracer"
 
-    def __init__(self, blood: BloodFlow, inflow: BufferZones):
-        """Blood without dye; `inflow` is asked where blood comes in."""
+    def __init__(self, blood: BloodFlow, inflow: BufferZones, outlets: Outlets):
+        """Blood without dye; it comes in as `inflow` says, and leaves by `outlets`."""
         self.blood = blood
-        particles = blood.particles
-        self.dye: ti.Field = dict(zip(particles.names, particles.fields, strict=True))[DYE.name]
+        fields = dict(zip(blood.particles.names, blood.particles.fields, strict=True))
+        self.dye: ti.Field = fields[DYE.name]
         """Concentration [-], shape (capacity,), in the order of the particles."""
+        self.age: ti.Field = fields[AGE.name]
+        """[s], likewise."""
+        self._aged_until = blood.time
+        """Time that the ages are of [s]."""
+        # Metal has no sums of 64-bit integers: there the last digits may differ.
+        self.age_sum = ti.field(ti.i64 if has_wide_atomics() else float)
+        """Sum of the ages of what has left, by place as the counts of `Outlets` [1/AGE_SCALE s]."""
+        # In a tree of its own: among 32-bit fields it overlaps them on Vulkan.
+        alone = ti.FieldsBuilder()
+        alone.dense(ti.i, outlets.count + 2).place(self.age_sum)
+        alone.finalize()
+        self._outlets = outlets
         self._inflow = inflow
         self._inlet = np.full(max(1, len(inflow.openings)), UNTOUCHED, float_dtype())
         """Concentration of what comes in through each driven opening."""
@@ -82,31 +106,51 @@ class Tracer(Boundary):
             allowed = ", ".join(names) or "none"
             raise InputError(f"dye: no blood comes in through {opening!r}; driven: {allowed}")
         self._inlet[names.index(opening)] = concentration
-        self.before_lists()
+        self._mark_buffers()
+
+    def mean_age(self) -> Floats:
+        """Mean age of all that has left by each place [s]; NaN where nothing has, (count + 2,)."""
+        left = self._outlets.outflow_counts()
+        total = self.age_sum.to_numpy() / AGE_SCALE
+        return np.where(left > 0, total / np.maximum(left, 1), np.nan)
 
     def before_lists(self) -> None:
-        """Mark the blood in the buffers, what was just added with it."""
+        """Mark the blood in the buffers, what was just added with it, and let blood age."""
+        self._mark_buffers()
+        elapsed, self._aged_until = self.blood.time - self._aged_until, self.blood.time
+        add_age(self.blood.particles, self._inflow.regions, self.age_sum, elapsed)
+
+    def _mark_buffers(self) -> None:
         if self.in_use:
             mark_buffers(self.blood.particles, self._inflow.regions, self._inlet)
 
     def compile_kernels(self, model: AccelerationModel) -> None:
-        """Mark nothing."""
+        """Mark nothing, and let no time pass."""
+        add_age(self.blood.particles, self._inflow.regions, self.age_sum, 0.0)
         mark_ball(self.blood.particles, 0.0, 0.0, 0.0, 0.0, 0.0)
         mark_buffers(
             self.blood.particles, self._inflow.regions, np.full_like(self._inlet, UNTOUCHED)
         )
 
     def reset(self) -> None:
-        """No dye comes in; the blood that has been put back has none."""
+        """No dye comes in, nothing has left; the blood that is put back has neither dye nor age."""
         self._inlet[:] = UNTOUCHED
+        self._aged_until = self.blood.time
+        self.age_sum.fill(0)
 
     def save_state(self) -> dict[str, Any]:
-        """Concentrations of what comes in; the particles' own are saved with them."""
-        return {"inlet": self._inlet.tolist()}
+        """What comes in and what has left; the particles' own are saved with them."""
+        return {
+            "inlet": self._inlet.tolist(),
+            "aged_until": self._aged_until,
+            "age_sum": self.age_sum.to_numpy(),
+        }
 
     def load_state(self, saved: dict[str, Any]) -> None:
         """Go on from a saved state."""
         self._inlet[:] = saved["inlet"]
+        self._aged_until = saved["aged_until"]
+        self.age_sum.from_numpy(np.asarray(saved["age_sum"]))
 
 
 def _require_concentration(concentration: float) -> None:
@@ -137,3 +181,17 @@ def mark_buffers(p: ti.template(), regions: ti.template(), inlet: ti.types.ndarr
             c = inlet[k]
             if c >= 0.0:
                 p.dye[i] = c
+
+
+@ti.kernel
+def add_age(p: ti.template(), regions: ti.template(), age_sum: ti.template(), elapsed: float):
+    """Let blood in the vessel age, and add up the ages of what is marked as gone.
+
+    Reads: position, identity.  Writes: age, age_sum.
+    """
+    for i in range(p.count[None]):
+        if regions.buffer_at(p.position[i]) < 0:
+            p.age[i] += elapsed
+        if p.identity[i] < 0:
+            place = -2 - p.identity[i]
+            ti.atomic_add(age_sum[place], ti.cast(p.age[i] * AGE_SCALE, age_sum.dtype))

@@ -157,4 +157,5 @@ class FakeSession:
             velocities=(np.abs(swirl) * [0.0, 0.0, 1.0]).astype(np.float32),
             droplets=self.droplets.astype(np.float32),
             dye=np.zeros(len(self.positions), np.float32),
+            age=np.linspace(0.0, self.scene.duration, len(self.positions), dtype=np.float32),
         )

@@ -47,9 +47,9 @@ class FakeSimulation:
         self.start = random.uniform(low, high, (particles, 3))
         self.velocity = np.zeros((particles, 3), np.float32)
         self.velocity[:, 2] = -np.linspace(0.0, 1.0, particles)
-        self.dye = np.zeros(particles, np.float32)
+        self.dye, self.age = (np.zeros(particles, np.float32) for _ in range(2))
         self.particles = SimpleNamespace(in_order=lambda field: field)
-        self.boundary = lambda kind: SimpleNamespace(dye=self.dye)
+        self.boundary = lambda kind: SimpleNamespace(dye=self.dye, age=self.age)
         self.tool = SimpleNamespace(surface=None, position=np.zeros(3))
         self.wall_motion = None
         self.wounds: list[Any] = []

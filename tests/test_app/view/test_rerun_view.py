@@ -18,13 +18,14 @@ from app.run.loop import drive
 from app.view import rerun_streams
 from app.view.appearance import (
     ASPECT,
-    COLOURS,
+    COLOURINGS,
     DYE_COLOUR,
     FIELD_OF_VIEW,
-    PACKED_COLOURS,
     SPEED_COLOURS,
+    colour_table,
+    colouring,
     eye,
-    speed_levels,
+    levels,
     upward,
 )
 from app.view.rerun_view import PLOTS, RerunView, application_of
@@ -69,6 +70,17 @@ def start_fake(
     )
 
 
+def unpacked(colours: Any) -> np.ndarray:
+    """Red, green, blue of 0xRRGGBBAA, (n, 3)."""
+    return np.array([[c >> shift & 0xFF for shift in (24, 16, 8)] for c in colours])
+
+
+def of_speed(simulation: Any) -> np.ndarray:
+    """Colours of the speeds of a fake simulation, whose blood expects 1 m/s, (n, 3)."""
+    speeds = np.linalg.norm(simulation.velocity, axis=1)
+    return colour_table(SPEED_COLOURS)[levels(speeds, 1.0)]
+
+
 def wait_for_frame(program: subprocess.Popen[str], frame: int) -> None:
     for line in cast(IO[str], program.stdout):
         if line.strip() == str(frame):
@@ -87,7 +99,7 @@ def test_the_recording_holds_what_the_simulation_showed(simulation: Any, tmp_pat
         expected = simulation.start + 0.01 * frame * simulation.velocity
         np.testing.assert_array_equal(x, expected.astype(np.float32))
     colours = rows(file, "/world/blood", "Points3D:colors")[3]
-    np.testing.assert_array_equal(colours, PACKED_COLOURS[speed_levels(simulation.velocity, 1.0)])
+    np.testing.assert_array_equal(unpacked(colours), of_speed(simulation))
     assert figures(file, "leaks", "wall_corrections") == {
         frame: [float(frame > 0), 4.0 * frame] for frame in range(6)
     }
@@ -343,12 +355,29 @@ def test_the_colours_of_speed_grow_evenly_lighter() -> None:
 
 
 def test_colours_run_from_rest_to_full_scale() -> None:
-    velocities = np.array(
-        [[0, 0, 0], [0, 1.0, 0], [0, 0, 2.0], [3, 4.0, 0], [np.nan, 0, 0], [0, np.inf, 0]]
-    )
-    assert speed_levels(velocities, full_scale=2.0).tolist() == [0, 127, 255, 255, 255, 255]
-    assert COLOURS.shape == (256, 3)
-    assert (PACKED_COLOURS[0], PACKED_COLOURS[-1]) == (0x6B0F1AFF, 0xFFF2C2FF)
+    values = np.array([0.0, 1.0, 2.0, 5.0, np.nan, np.inf])
+    assert levels(values, full_scale=2.0).tolist() == [0, 127, 255, 255, 255, 255]
+    table = colour_table(SPEED_COLOURS)
+    assert table.shape == (256, 3)
+    assert table[[0, -1]].tolist() == [[0x6B, 0x0F, 0x1A], [0xFF, 0xF2, 0xC2]]
+
+
+@pytest.mark.parametrize("of", COLOURINGS)
+def test_blood_has_the_colour_of_its_speed_or_of_its_age(
+    simulation: Any, tmp_path: Path, of: str
+) -> None:
+    file, duration = tmp_path / "run.rrd", simulation.scene.duration
+    simulation.age[:] = np.linspace(0.0, 1.5 * duration, len(simulation.age))
+    view = RerunView(simulation, file, colour=of)
+    drive(simulation, [view], until=0.01, frame_interval=0.01)
+    expected = of_speed(simulation)
+    if of == "age":
+        anchors = colouring(of, simulation.scene, simulation.derived).anchors
+        expected = colour_table(anchors)[levels(simulation.age, duration)]
+        assert expected[-1].tolist() == [0xFD, 0xE7, 0x25], "the oldest is yellow"
+    colours = rows(file, "/world/blood", "Points3D:colors")[1]
+    np.testing.assert_array_equal(unpacked(colours), expected)
+    assert f"Colour is {of}:" in view._document(simulation)
 
 
 @pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 4.0, 1.0), (0, 0, 0)])
@@ -393,9 +422,8 @@ def test_dyed_blood_has_the_colour_of_the_dye_as_far_as_it_is_dyed(
     file = tmp_path / "run.rrd"
     simulation.dye[:3] = 1.0, 0.5, 0.0
     drive(simulation, [RerunView(simulation, file)], until=0.01, frame_interval=0.01)
-    packed = rows(file, "/world/blood", "Points3D:colors")[1]
-    colours = np.array([[c >> shift & 0xFF for shift in (24, 16, 8)] for c in packed])
-    at_speed = COLOURS[speed_levels(simulation.velocity, 1.0)].astype(float)
+    colours = unpacked(rows(file, "/world/blood", "Points3D:colors")[1])
+    at_speed = of_speed(simulation).astype(float)
     np.testing.assert_array_equal(colours[0], DYE_COLOUR)
     np.testing.assert_allclose(colours[1], 0.5 * (at_speed[1] + DYE_COLOUR), atol=0.5)
     np.testing.assert_array_equal(colours[2:], at_speed[2:])

@@ -15,8 +15,8 @@ def state_of(sim: Simulation) -> tuple[list[np.ndarray], dict]:
     kept = sim.save_state()
     order = np.argsort(kept.particles["identity"])
     rows = [values[order] for values in kept.particles.values()]
-    removed = kept.boundaries["outlets"].pop("removed")
-    return [removed, *rows, *wall_of(sim)], kept.boundaries
+    counted = [kept.boundaries["outlets"].pop("removed"), kept.boundaries["tracer"].pop("age_sum")]
+    return [*counted, *rows, *wall_of(sim)], kept.boundaries
 
 
 def test_a_session_goes_on_bitwise_with_wounds_suction_a_moving_tool_and_a_tilt(sim, tmp_path):

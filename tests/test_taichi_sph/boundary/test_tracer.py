@@ -1,9 +1,9 @@
-"""Dye: which blood is marked, that the mark stays with its particle, and what is refused."""
+"""Dye and age: which blood is marked, that a mark stays with its particle, what is refused."""
 
 import numpy as np
 import pytest
 
-from driven_tube import LENGTH, OF_ONE, D
+from driven_tube import FLOW, LENGTH, OF_ONE, D
 from taichi_sph.boundary.tracer import Tracer
 from taichi_sph.errors import InputError
 from taichi_sph.simulation import Simulation
@@ -93,3 +93,63 @@ def test_what_cannot_be_marked_is_refused_and_nothing_changes(driven, ask, says)
         ask(tracer_of(driven))
     assert says in str(refused.value)
     assert not any(dye_of(driven).values()) and not tracer_of(driven).in_use
+
+
+def test_blood_is_as_old_as_it_has_been_in_the_vessel(driven):
+    rows = driven.particles.rows()
+    # Farther from both ends than blood flows within the time, at twice the mean speed.
+    inside = rows["identity"][np.abs(rows["position"][:, 2]) < 2.5e-3]
+    age = {}
+    for time in (0.004, 0.01):
+        driven.advance_to(time)
+        rows = driven.save_state().particles
+        age = dict(zip(rows["identity"].tolist(), rows["age"].tolist(), strict=True))
+        # Behind by the steps since the lists were built.
+        assert all(time - 2e-3 < age[i] <= time * (1.0 + 1e-5) for i in inside.tolist())
+    added = [i for i in age if i >= driven.inflow.next_identity - driven.inflow.added]
+    beyond = rows["identity"][rows["position"][:, 2] > 0.5 * LENGTH]
+    assert added and not any(age[i] for i in {*added, *beyond.tolist()}), "not yet come in"
+
+
+def test_the_mean_age_of_what_leaves_a_steady_flow_is_its_volume_over_the_flow(driven):
+    # Danckwerts 1953.  The tube is emptied some twice before, and three times meanwhile.
+    places = len(driven.vessel.openings) + 2
+    bottom = 2 + [o.name for o in driven.vessel.openings].index("bottom")
+
+    def left() -> tuple[float, int]:
+        count = driven.outlets.outflow_counts()
+        mean = tracer_of(driven).mean_age()
+        assert mean.shape == count.shape >= (places,)
+        assert np.isnan(mean[count == 0]).all()
+        assert driven.diagnostics().mean_age["bottom"] == mean[bottom]
+        return float(mean[bottom] * count[bottom]), int(count[bottom])
+
+    driven.advance_to(0.15)
+    sum_before, count_before = left()
+    volumes = []
+    for time in np.linspace(0.16, 0.33, 18):
+        driven.advance_to(time)
+        z = driven.positions()[:, 2]
+        volumes.append((np.abs(z) < 0.5 * LENGTH).sum() * OF_ONE)
+    sum_after, count_after = left()
+    assert count_after - count_before > 1500
+    mean = (sum_after - sum_before) / (count_after - count_before)
+    # Ages are behind by the steps between two lists, on the way in and on the way out.
+    assert mean == pytest.approx(np.mean(volumes) / FLOW, rel=0.02)
+
+
+def test_a_state_keeps_ages_and_those_of_what_has_left_and_a_reset_begins_anew(driven):
+    driven.advance_to(0.08)
+    state = driven.save_state()
+    driven.advance_to(0.11)
+    first, mean = driven.save_state().particles["age"], tracer_of(driven).mean_age()
+    driven.reset()
+    assert not driven.particles.rows()["age"].any()
+    assert np.isnan(tracer_of(driven).mean_age()).all()
+    start = driven.time
+    driven.advance_to(start + 0.01)
+    assert driven.particles.rows()["age"].max() <= 0.01 * (1.0 + 1e-5)
+    driven.load_state(state)
+    driven.advance_to(0.11)
+    assert driven.save_state().particles["age"].tobytes() == first.tobytes()
+    np.testing.assert_array_equal(tracer_of(driven).mean_age(), mean)
