@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 import threading
+import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,8 @@ from taichi_sph.system import threads as known_threads
 
 ARCHITECTURES = ("cpu", "gpu")
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+LONGEST_LOCK = 60.0
+"""Taichi holds the lock of its compiled kernels for moments; older [s], nobody holds it."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,17 @@ def _can_write(folder: Path) -> bool:
         return False
 
 
+def _remove_stale_lock(lock: Path) -> None:
+    """Remove the lock that a process has left which was killed while it wrote kernels.
+
+    With it there Taichi neither reads nor writes the folder any more: every start compiles all
+    anew, some seconds, without a word.
+    """
+    with contextlib.suppress(OSError):
+        if time.time() - lock.stat().st_mtime > LONGEST_LOCK:
+            lock.unlink()
+
+
 def _kernel_cache() -> str | None:
     """Folder for compiled kernels where Taichi's own cannot be written; None where it can.
 
@@ -125,7 +139,9 @@ def _kernel_cache() -> str | None:
     """
     asked = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    if _can_write(Path(asked) if asked else Path(base, "taichi", "ticache")):
+    folder = Path(asked) if asked else Path(base, "taichi", "ticache")
+    if _can_write(folder):
+        _remove_stale_lock(folder / "ticache.lock")
         return None
     # Taichi would warn of an argument that is not what the variable says.
     os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)

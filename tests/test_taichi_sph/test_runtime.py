@@ -93,3 +93,23 @@ def test_nothing_that_can_be_written_is_a_sentence(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(runtime.tempfile, "mkdtemp", full)
     with pytest.raises(InputError, match=r"^no folder can be written for compiled kernels; let "):
         runtime._kernel_cache()
+
+
+def test_kernels_are_kept_again_after_a_process_was_killed_while_it_wrote_them(tmp_path):
+    def run() -> None:
+        environment = os.environ | {
+            "PYTHONPATH": str(ROOT), "TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)
+        }  # fmt: skip
+        # From a file: Taichi reads the source of its kernels.
+        script = tmp_path / "run.py"
+        script.write_text(RUN)
+        subprocess.run([sys.executable, script], env=environment, check=True)
+
+    lock = tmp_path / "ticache.lock"
+    lock.touch()
+    run()
+    assert not list(tmp_path.glob("*.tic")), "Taichi leaves a folder alone that another writes"
+    os.utime(lock, (0.0, 0.0))
+    run()
+    assert list(tmp_path.glob("*.tic"))
+    assert not lock.exists()
