@@ -22,8 +22,8 @@ from taichi_sph.system import threads as known_threads
 
 ARCHITECTURES = ("cpu", "gpu")
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
-LONGEST_LOCK = 60.0
-"""Taichi holds the lock of its compiled kernels for moments; older [s], nobody holds it."""
+LONGEST_LOCK = 15.0
+"""Taichi holds the lock of its compiled kernels for a moment; older [s], nobody holds it."""
 
 
 @dataclass(frozen=True)

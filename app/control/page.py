@@ -228,7 +228,7 @@ class ControlPage:
 
         @choice.on_update
         async def _(event: Any) -> None:
-            chosen = colouring(choice.value, simulation.scene, simulation.derived)
+            chosen = colouring(choice.value, simulation)
             self._scene.colouring, bar.content = chosen, colour_bar(chosen)
             # The next frame may be long in coming.
             self._recolour.set()

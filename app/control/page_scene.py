@@ -55,7 +55,7 @@ class PageScene:
         self._simulation = simulation
         self._tool = simulation.tool
         self._spacing = simulation.scene.discretization.spacing
-        self.colouring = colouring("speed", simulation.scene, simulation.derived)
+        self.colouring = colouring("speed", simulation)
         """What the colour of blood means."""
         self._wounds: dict[int, Wound] = {}
         self._rims: list[Any] = []

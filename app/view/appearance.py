@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from taichi_sph.derived import Derived
-    from taichi_sph.scene import Scene
+    from taichi_sph.simulation import Simulation
 
 Floats = NDArray[np.float64]
 
@@ -95,12 +94,20 @@ COLOURINGS = ("speed", "age")
 """What blood may be coloured by."""
 
 
-def colouring(of: str, scene: "Scene", derived: "Derived") -> Colouring:
-    """The colouring of a scene's blood by one of COLOURINGS."""
+def colouring(of: str, simulation: "Simulation") -> Colouring:
+    """The colouring of a simulation's blood by one of COLOURINGS."""
     if of == "age":
-        return Colouring(of, AGE_COLOURS, scene.duration, "s", "new")
+        return Colouring(of, AGE_COLOURS, _old(simulation), "s", "new")
     # Free fall over the whole height, or what drives: little is faster.
-    return Colouring(of, SPEED_COLOURS, derived.expected_speed or 1.0, "m/s", "at rest")
+    return Colouring(of, SPEED_COLOURS, simulation.derived.expected_speed or 1.0, "m/s", "at rest")
+
+
+def _old(simulation: "Simulation") -> float:
+    """An age that little blood outlives [s]: twice V/Q of what is pumped in, or the duration."""
+    duration = simulation.scene.duration
+    flows = [o.flow * o.waveform.mean for o in simulation.inflow.openings if o.flow is not None]
+    pumped = sum(flow for flow in flows if flow > 0.0)
+    return min(duration, 2.0 * simulation.vessel.volume / pumped) if pumped else duration
 
 
 @functools.cache

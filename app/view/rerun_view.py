@@ -141,7 +141,7 @@ class RerunView:
         self.every, self._checkpoint = every, checkpoint
         self._radius = 0.5 * scene.discretization.spacing
         self._volume = simulation.derived.blood_particles * scene.discretization.spacing**3
-        self._colouring = colouring(colour, scene, simulation.derived)
+        self._colouring = colouring(colour, simulation)
         self._last: tuple[int, float] = (-1, 0.0)
         self._notes: Items = []
         self._wounded = self._sucked = False

@@ -51,6 +51,7 @@ class FakeSession:
             derived=SimpleNamespace(expected_speed=1.0),
             tool=self.tool,
             wounds=self.wounds,
+            inflow=SimpleNamespace(openings=[]),
             model=SimpleNamespace(name="physics"),
         )
         self.models = SimpleNamespace(

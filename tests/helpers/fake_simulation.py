@@ -52,6 +52,7 @@ class FakeSimulation:
         self.boundary = lambda kind: SimpleNamespace(dye=self.dye, age=self.age)
         self.tool = SimpleNamespace(surface=None, position=np.zeros(3))
         self.wall_motion = None
+        self.inflow = SimpleNamespace(openings=[])
         self.wounds: list[Any] = []
         self.suction = SimpleNamespace(rate=0.0)
 

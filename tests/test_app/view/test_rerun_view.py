@@ -372,12 +372,28 @@ def test_blood_has_the_colour_of_its_speed_or_of_its_age(
     drive(simulation, [view], until=0.01, frame_interval=0.01)
     expected = of_speed(simulation)
     if of == "age":
-        anchors = colouring(of, simulation.scene, simulation.derived).anchors
+        anchors = colouring(of, simulation).anchors
         expected = colour_table(anchors)[levels(simulation.age, duration)]
         assert expected[-1].tolist() == [0xFD, 0xE7, 0x25], "the oldest is yellow"
     colours = rows(file, "/world/blood", "Points3D:colors")[1]
     np.testing.assert_array_equal(unpacked(colours), expected)
     assert f"Colour is {of}:" in view._document(simulation)
+
+
+def test_the_colours_of_age_end_at_twice_the_time_in_which_a_pump_fills_the_vessel(
+    simulation: Any,
+) -> None:
+    def opening(flow: float | None, mean: float) -> Any:
+        return SimpleNamespace(flow=flow, waveform=SimpleNamespace(mean=mean))
+
+    volume, duration = simulation.vessel.volume, simulation.scene.duration
+    assert colouring("age", simulation).full_scale == duration
+    flow = 4.0 * volume / duration
+    # What is pumped out and what a reservoir drives do not count.
+    simulation.inflow.openings = [opening(flow, 2.0), opening(-flow, 1.0), opening(None, 1.0)]
+    assert colouring("age", simulation).full_scale == pytest.approx(duration / 4.0)
+    simulation.inflow.openings = [opening(0.1 * flow, 1.0)]
+    assert colouring("age", simulation).full_scale == duration
 
 
 @pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 4.0, 1.0), (0, 0, 0)])
