@@ -1,25 +1,24 @@
 """A surgery simulator's loop in small: blood, a wound, a tool's force, a clamp.
 
-    python docs/engine.py SCENE [SECONDS]
+    python docs/engine.py SCENE.toml [WEIGHTS.npz [SECONDS]]
 
 Every frame it asks for what an engine draws and feels, into arrays that it owns.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
-from app.models import model_factory
-from app.scenes.library import find_scene
-from taichi_sph import Simulation, start
-from taichi_sph.runtime import float_dtype
+from nn import load_pcnet
+from taichi_sph import Simulation, float_dtype, implicit, read_scene, start
 
-scene = find_scene(sys.argv[1])
-seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 0.2
+scene = read_scene(Path(sys.argv[1]))
+seconds = float(sys.argv[3]) if len(sys.argv) > 3 else 0.2
+model = load_pcnet(Path(sys.argv[2]), scene) if len(sys.argv) > 2 else implicit(scene)
 start(arch="cpu")
-simulation = Simulation.from_scene(scene, model_factory("pcnet", scene))
-physics = simulation.make_model(model_factory("physics", scene))
-simulation.compile_kernels([simulation.model, physics])  # compile now, not when it is needed
+simulation = Simulation.from_scene(scene, model)
+simulation.compile_kernels([simulation.model])  # compile now, not when it is needed
 
 room = simulation.particles.capacity
 identity = np.zeros(room, np.int32)

@@ -1,6 +1,6 @@
 """SPH for blood in a vessel, on Taichi: the public names.
 
-An engine needs nothing else but `nn.pcnet`, for the learned model: docs/engine.py is a whole loop.
+An engine needs nothing else but `nn.load_pcnet`, the learned model: docs/engine.py is a loop.
 """
 
 import os

@@ -51,7 +51,7 @@ def rtol(precision: str) -> float:
 
 @pytest.fixture(scope="session")
 def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a coarse box scene, blood that stands in it, and three recorded columns."""
+    """A folder with a coarse box scene, blood that stands in it."""
     shipped = VESSELS / "box"
     folder = tmp_path_factory.mktemp("box")
     (folder / "lumen.ply").write_bytes((shipped / "lumen.ply").read_bytes())
@@ -59,6 +59,13 @@ def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
     coarse = text.replace("spacing = 0.001 ", "spacing = 0.002 ")
     assert coarse != text
     (folder / "scene.toml").write_text(coarse)
-    vesselflow("record", folder, "--heights", "0.012,0.020,0.016", "--frames", "60",
-               "--substeps", "4", "--out", folder / "data.h5")  # fmt: skip
     return folder
+
+
+@pytest.fixture(scope="session")
+def recorded(box: Path) -> Path:
+    """A dataset of three columns in the coarse box."""
+    data = box / "data.h5"
+    vesselflow("record", box, "--heights", "0.012,0.020,0.016", "--frames", "60",
+               "--substeps", "4", "--out", data)  # fmt: skip
+    return data

@@ -220,14 +220,9 @@ def drive(
         finally:
             if progress:
                 progress.close()
-        stalled = []
-        for observer in observers:
-            try:
-                if observer.close(ending):
-                    stalled.append(observer)
-            except OSError as caught:
-                if error is None:
-                    error, ending = caught, str(caught)
+        stalled, failed = _close(observers, ending)
+        if failed is not None and error is None:
+            error, ending = failed, str(failed)
     wall_time = time.perf_counter() - began
     summary = _summary_of(
         simulation, figures, step_times,
@@ -237,6 +232,18 @@ def drive(
         diverged=isinstance(error, RunError), ending=ending,
     )  # fmt: skip
     return Outcome(summary, error, stopped, tuple(stalled))
+
+
+def _close(observers: Sequence[Observer], ending: str) -> tuple[list[Observer], OSError | None]:
+    """Close all; those that would hold up Python's exit, and the first that could not write."""
+    stalled, failed = [], None
+    for observer in observers:
+        try:
+            if observer.close(ending):
+                stalled.append(observer)
+        except OSError as caught:
+            failed = failed or caught
+    return stalled, failed
 
 
 def _summary_of(

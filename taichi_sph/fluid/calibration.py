@@ -7,6 +7,7 @@ carries one factor that makes it exact there.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -49,6 +50,37 @@ def _lattice(radius: float, spacing: float) -> np.ndarray:
     return points[(r > 0.0) & (r < radius)]
 
 
+def _slope(kernel: WendlandC2, points: np.ndarray) -> np.ndarray:
+    """(dW/dr)/r at points from the origin [m], (n, 3), shape (n,)."""
+    return kernel.slope_of(np.linalg.norm(points, axis=1))
+
+
+def _wall_sums(kernel: WendlandC2, d: float, wall_spacing: float, depth: float) -> np.ndarray:
+    """Sums over proxies `depth` [m] below: W, force, friction, gradient of simple shear.
+
+    Averaged over where the particle stands above the proxies.
+    """
+    k = int(np.ceil(kernel.support_radius / wall_spacing))
+    axis = wall_spacing * np.arange(-k, k + 1)
+    plane = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    proxy_volume = 1.0 / kernel.w_of(np.linalg.norm(plane, axis=1)).sum()
+    eps = softening(kernel)
+    sums = np.zeros(4)
+    shifts = wall_spacing * (np.arange(8) + 0.5) / 8.0
+    for sx in shifts:
+        for sy in shifts:
+            p = np.column_stack([plane + (sx, sy), np.full(len(plane), -depth)])
+            r2 = (p**2).sum(axis=1)
+            s = _slope(kernel, p)
+            sums += [
+                kernel.w_of(np.sqrt(r2)).sum(),
+                (s * p[:, 2]).sum(),
+                (s * r2 / (r2 + eps)).sum(),
+                (s * p[:, 2] * (-0.5 * d)).sum(),
+            ]
+    return np.asarray(sums * proxy_volume / len(shifts) ** 2)
+
+
 def calibrate(
     kernel: WendlandC2, spacing: float, wall_spacing: float, rest_density: float
 ) -> Calibration:
@@ -65,10 +97,7 @@ def calibrate(
     """
     d = spacing
     eps = softening(kernel)
-
-    def slope(points: np.ndarray) -> np.ndarray:
-        return kernel.slope_of(np.linalg.norm(points, axis=1))
-
+    slope = partial(_slope, kernel)
     bulk = _lattice(kernel.support_radius, d)
     number_density = kernel.peak + kernel.w_of(np.linalg.norm(bulk, axis=1)).sum()
     mass = rest_density / number_density
@@ -87,30 +116,7 @@ def calibrate(
     missing_density = volume * kernel.w_of(np.linalg.norm(missing, axis=1)).sum()
     missing_force = -2.0 * volume * (slope(missing) * missing[:, 2]).sum()
 
-    k = int(np.ceil(kernel.support_radius / wall_spacing))
-    axis = wall_spacing * np.arange(-k, k + 1)
-    plane = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-    proxy_volume = 1.0 / kernel.w_of(np.linalg.norm(plane, axis=1)).sum()
-
-    def wall_sums(depth: float) -> np.ndarray:
-        """Sums over proxies `depth` below: W, force, friction, gradient of simple shear.
-
-        Averaged over where the particle stands above the proxies.
-        """
-        sums = np.zeros(4)
-        shifts = wall_spacing * (np.arange(8) + 0.5) / 8.0
-        for sx in shifts:
-            for sy in shifts:
-                p = np.column_stack([plane + (sx, sy), np.full(len(plane), -depth)])
-                r2 = (p**2).sum(axis=1)
-                s = slope(p)
-                sums += [
-                    kernel.w_of(np.sqrt(r2)).sum(),
-                    (s * p[:, 2]).sum(),
-                    (s * r2 / (r2 + eps)).sum(),
-                    (s * p[:, 2] * (-0.5 * d)).sum(),
-                ]
-        return sums * proxy_volume / len(shifts) ** 2
+    wall_sums = partial(_wall_sums, kernel, d, wall_spacing)
 
     def excess_force(depth: float) -> float:
         """Force over density of the wall, less what the missing blood would give [1/m]."""

@@ -122,6 +122,7 @@ class Keeper:
         assert ending == "finished"
 
 
+@pytest.mark.validation
 def test_positions_recorded_are_those_of_the_simulation(scene: Path, tmp_path: Path) -> None:
     from app.run.loop import drive
     from app.view.rerun_view import RerunView
@@ -149,7 +150,10 @@ def test_positions_recorded_are_those_of_the_simulation(scene: Path, tmp_path: P
         simulation.restart_with(np.concatenate([start, start]), np.zeros((2 * len(start), 3)))
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.validation), (signal.SIGTERM, 143)],
+)
 def test_a_signal_ends_a_run_with_its_files_whole(
     scene: Path, tmp_path: Path, number: int, code: int
 ) -> None:

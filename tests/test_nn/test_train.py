@@ -52,9 +52,9 @@ def stage() -> ReplaySimulation:
 
 
 @pytest.fixture(scope="module")
-def course(box: Path) -> Iterator[TrainingRuns]:
+def course(recorded: Path) -> Iterator[TrainingRuns]:
     """One for all trainings: each new one compiles everything again."""
-    with Dataset(box / "data.h5") as file:
+    with Dataset(recorded) as file:
         yield TrainingRuns(file, [0])
 
 
@@ -116,23 +116,45 @@ def one_step_error(course: TrainingRuns, weights: Weights) -> float:
     return float(np.sqrt(np.concatenate(wrong).mean()))
 
 
-def test_training_learns_and_its_weights_run(box: Path, course: TrainingRuns, tmp_path: Path):
-    data, out, picture = box / "data.h5", tmp_path / "w.npz", tmp_path / "w.png"
-    vesselflow("train", data, "--out", out, "--iterations", "60", "--plot", picture)
-    told = msgspec.json.decode(out.with_suffix(".history.json").read_bytes())
-    assert told["validations"][-1]["iteration"] == 60
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert not list(tmp_path.glob("*.checkpoint*"))
-    learned = one_step_error(course, Weights.load(out))
+SETTINGS = Settings(iterations=40, validate_every=10)
+
+
+@pytest.fixture(scope="module")
+def trained(course: TrainingRuns, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a short training."""
+    out = tmp_path_factory.mktemp("trained") / "whole.npz"
+    _, history = train_weights(course, out, SETTINGS, report=quiet)
+    assert [row["iteration"] for row in history] == [10, 20, 30, 40]
+    return out
+
+
+def quiet(_: Progress) -> None:
+    """Say nothing."""
+
+
+@pytest.mark.validation
+def test_training_learns_and_its_weights_run(course: TrainingRuns, trained: Path):
+    weights = Weights.load(trained)
+    learned = one_step_error(course, weights)
     # What needs no training: a straight line through the 23 features, and nothing at all.
     straight = one_step_error(course, ridge(course, Settings(head="direct")))
     nothing = one_step_error(course, persistence(course, Settings(head="direct")))
     assert learned < 0.7 * min(straight, nothing)
-    figures = course.rollout(course.pcnet(Weights.load(out)), course.held[0])
+    figures = course.rollout(course.pcnet(weights), course.held[0])
     assert figures["survived"] == 1.0
     # Blood that stands has compression from its own weight, g h/c^2 = 0.1 %, and from the layers'
     # settling; it must not collapse.
     assert figures["compression_p99"] < 0.1
+
+
+@pytest.mark.validation
+def test_the_command_trains_and_its_weights_run(box: Path, recorded: Path, tmp_path: Path):
+    out, picture = tmp_path / "w.npz", tmp_path / "w.png"
+    vesselflow("train", recorded, "--out", out, "--iterations", "4", "--plot", picture)
+    told = msgspec.json.decode(out.with_suffix(".history.json").read_bytes())
+    assert told["validations"][-1]["iteration"] == 4
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert not list(tmp_path.glob("*.checkpoint*"))
     output = vesselflow("run", box, "--until", "0.002", "--model", "pcnet", "--weights", out)
     assert "leaks 0" in output
 
@@ -141,36 +163,33 @@ class KilledError(Exception):
     """Stands for whatever ends a training early."""
 
 
-def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, tmp_path):
-    settings = Settings(iterations=20, validate_every=5)
-    whole, cut = tmp_path / "whole.npz", tmp_path / "cut.npz"
-
-    def quiet(_: Progress) -> None:
-        pass
+@pytest.mark.validation
+def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, trained, tmp_path):
+    cut = tmp_path / "cut.npz"
 
     def kill(at: Progress) -> None:
-        if at.iteration == 10:
+        if at.iteration == 20:
             raise KilledError
 
-    train_weights(course, whole, settings, report=quiet)
     with pytest.raises(KilledError):
-        train_weights(course, cut, settings, report=kill)
+        train_weights(course, cut, SETTINGS, report=kill)
     checkpoint = tmp_path / "cut.npz.checkpoint"
-    other = Settings(iterations=20, validate_every=5, seed=1)
+    other = Settings(iterations=40, validate_every=10, seed=1)
     with pytest.raises(InputError, match=r"cut.npz.checkpoint: holds a training with seed 0"):
         train_weights(course, cut, other, report=quiet)
-    weights, history = train_weights(course, cut, settings, report=quiet)
+    weights, history = train_weights(course, cut, SETTINGS, report=quiet)
     assert not checkpoint.exists()
-    assert [row["iteration"] for row in history] == [5, 10, 15, 20]
-    expected = Weights.load(whole)
+    assert [row["iteration"] for row in history] == [10, 20, 30, 40]
+    expected = Weights.load(trained)
     for (w, b), (w_0, b_0) in zip(weights.layers, expected.layers, strict=True):
         np.testing.assert_array_equal(w, w_0)
         np.testing.assert_array_equal(b, b_0)
     checkpoint.write_bytes(b"PK")
     with pytest.raises(InputError, match="not a checkpoint, or a cut one"):
-        train_weights(course, cut, settings, report=quiet)
+        train_weights(course, cut, SETTINGS, report=quiet)
 
 
+@pytest.mark.validation
 def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
     """The physics takes four steps a frame; rolled out from the first frame it is the recording."""
     figures = course.rollout(course.replay.physics, course.held[0])
@@ -179,6 +198,7 @@ def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
     assert figures["path_error"] < 0.1
 
 
+@pytest.mark.validation
 def test_ridge_finds_a_straight_line(course, monkeypatch):
     """Targets that are linear in the features, with an offset, are met nearly exactly."""
     features, _ = course.examples(32)
@@ -192,6 +212,7 @@ def test_ridge_finds_a_straight_line(course, monkeypatch):
     assert np.abs(found - target).max() < 0.02 * np.abs(target - target.mean(axis=0)).max()
 
 
+@pytest.mark.validation
 def test_persistence_gives_back_the_previous_acceleration(course):
     weights = persistence(course, Settings(head="direct"))
     features, _ = course.examples(1)

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from app.bench import profile as passes
 from app.jobs.process import in_own_process
@@ -19,6 +20,7 @@ def test_candidates_are_the_particles_of_the_cells_around():
     assert expected > n
 
 
+@pytest.mark.validation
 def test_passes_go_over_the_lists_and_stay_below_the_limit_of_arithmetic(tmp_path):
     scene = varied(find_scene("aortoiliac"), 0.006, 1.8e-3)
     found, limits = in_own_process(passes.measure_passes, scene, weights_for(scene), "cpu", 1)

@@ -20,6 +20,7 @@ def test_a_row_holds_the_quartiles_and_the_cost_of_a_particle():
     assert row.real_time_factor == pytest.approx(1e-5 / 3e-3)
 
 
+@pytest.mark.validation
 def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for():
     row = in_own_process(columns.measure_column, 6, 8, "cpu", 1)
     assert row.blood_particles == 6 * 6 * 8
@@ -29,6 +30,7 @@ def test_a_column_is_measured_in_a_process_of_its_own_and_has_the_size_asked_for
 
 
 @needs_viser
+@pytest.mark.validation
 def test_what_control_costs_is_measured_with_a_hand_and_an_eye_on_the_run(tmp_path):
     scene = msgspec.structs.replace(read_scene(scene_path("tube")), frame_interval=1e-3)
     found = in_own_process(measure_overhead, scene, weights_for(scene), "cpu", 1, tmp_path, 2)
@@ -47,6 +49,7 @@ def test_a_peer_that_is_not_installed_is_one_sentence(monkeypatch):
         run_bench(BenchOptions((), peer=True))
 
 
+@pytest.mark.validation
 def test_too_short_a_time_is_one_sentence(capsys):
     with pytest.raises(InputError, match=r"^--until 1e-05: the first 10 steps of PcNet compile"):
         run_bench(BenchOptions(((scene_path("tube"), None),), until=1e-5))

@@ -185,6 +185,7 @@ def test_wounds_are_shown_until_they_are_clamped(page: ControlPage, session: Any
 
 
 @needs_viser
+@pytest.mark.validation
 def test_a_browser_that_has_frozen_holds_up_nothing(page: ControlPage, session: Any) -> None:
     session.positions = np.repeat(session.positions, 100, axis=0)
     with Visitor(page), Visitor(page) as other:

@@ -42,6 +42,7 @@ def whole(driven: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.validation
 def test_a_script_is_logged_and_replayed_bit_for_bit(whole: Path) -> None:
     log = read_session(whole / "s.jsonl", "replay")
     assert [e.command for e in log.entries if e.source == "script"] == [
@@ -59,7 +60,8 @@ def test_a_replay_notices_another_course(whole: Path, tmp_path: Path) -> None:
     assert "differs from frame" in error.splitlines()[-1]
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(10, marks=pytest.mark.validation)])
+@pytest.mark.validation
+@pytest.mark.parametrize("kills", [1, 10])
 def test_a_session_killed_again_and_again_ends_bitwise_like_the_whole_one(
     whole: Path, driven: Path, tmp_path: Path, kills: int
 ) -> None:

@@ -12,7 +12,14 @@ PAPER = {"A": 56_000, "B": 73_000}
 """Proxies of the paper's scenes."""
 
 
-@pytest.mark.parametrize("name", list(shipped()))
+FAST = ("aortoiliac", "carotid_surgery")
+"""One that only falls and one that is driven; the others are started with the slow proofs."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [n if n in FAST else pytest.param(n, marks=pytest.mark.validation) for n in shipped()],
+)
 def test_every_shipped_scene_starts_and_keeps_its_blood(name):
     simulation = Simulation.from_scene(find_scene(name))
     before = simulation.positions()

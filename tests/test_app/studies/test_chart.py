@@ -124,6 +124,7 @@ def test_a_driven_scene_is_refused(command: str, tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.validation
 def test_the_command_measures_and_draws(box: Path, tmp_path: Path):
     out, picture = tmp_path / "chart.csv", tmp_path / "chart.png"
     command = ("chart", box, "--until", "0.02", "--only", "2 rounds", "--out", out)

@@ -72,6 +72,7 @@ def test_a_run_that_died_is_measured_while_it_lived_and_says_so():
     assert result.path_error == pytest.approx(0.001 / 0.01)
 
 
+@pytest.mark.validation
 def test_the_command_pours_physics_network_and_soft_physics(tmp_path):
     figures, picture = tmp_path / "c.json", tmp_path / "c.png"
     command = [sys.executable, "-m", "app", "compare", "aortoiliac", "--height", "0.004"]

@@ -40,8 +40,11 @@ def test_a_line_has_medians_and_counts_the_dead():
     assert mixed.survived == 1.0
 
 
-def test_one_variant_is_measured_and_what_is_measured_is_not_repeated(box: Path, tmp_path: Path):
-    data, out, picture = box / "data.h5", tmp_path / "ladder.json", tmp_path / "ladder.png"
+@pytest.mark.validation
+def test_one_variant_is_measured_and_what_is_measured_is_not_repeated(
+    recorded: Path, tmp_path: Path
+):
+    data, out, picture = recorded, tmp_path / "ladder.json", tmp_path / "ladder.png"
     (found,) = in_own_process(measure, Job(data, data.name, "pressure, no input", 0, 6, "cpu"))
     assert found.survived == 1.0
     assert 0.0 < found.compression_p99 < 0.3

@@ -155,6 +155,7 @@ def has_children(process: int) -> bool:
     return any(file.read_text() for file in Path(f"/proc/{process}/task").glob("*/children"))
 
 
+@pytest.mark.validation
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_a_cluster_records_the_same_bits_and_bears_the_loss_of_a_worker(
     recorded: Recording, begun: bytes, make: Maker, tmp_path: Path
@@ -321,6 +322,7 @@ def kill_itself(job: RecordingJob) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.validation
 def test_a_recording_that_is_killed_again_and_again_says_how_it_goes_on(
     make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

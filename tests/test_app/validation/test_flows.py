@@ -64,6 +64,7 @@ def channel_flow() -> list[tuple[float, np.ndarray, np.ndarray]]:
     return result
 
 
+@pytest.mark.validation
 def test_a_channel_eight_spacings_wide_starts_up_as_theory_says(channel_flow):
     for _, speed, exact in channel_flow:
         assert np.linalg.norm(speed - exact) < 0.08 * np.linalg.norm(exact)

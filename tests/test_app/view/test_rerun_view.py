@@ -177,6 +177,7 @@ def test_sigterm_leaves_a_whole_recording(tmp_path: Path) -> None:
     assert len(positions(file)) >= 21
 
 
+@pytest.mark.validation
 def test_kill_leaves_a_recording_to_about_the_last_five_seconds(tmp_path: Path) -> None:
     file = tmp_path / "run.rrd"
     with start_fake(file, 10_000, 500) as program:

@@ -78,6 +78,7 @@ def test_more_pressure_on_one_side_accelerates_the_column_by_dp_over_rho_l(drive
     assert np.abs(speed[:2]).max() < 0.02 * expected
 
 
+@pytest.mark.validation
 def test_a_reservoir_spends_head_on_the_speed_of_what_it_gives(tmp_path):
     # A column of length L between two reservoirs of one pressure: L du/dt = -u^2/2 and friction,
     # which is small in blood as thin as this.  Given the whole pressure at both ends it is driven

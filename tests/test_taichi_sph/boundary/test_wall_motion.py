@@ -252,6 +252,7 @@ def test_there_is_room_for_the_blood_of_the_widest_lumen(pulsing):
     assert pulsing.particles.capacity >= widest_lumen() / D**3 + buffers
 
 
+@pytest.mark.validation
 def test_a_shut_vessel_takes_in_and_gives_back_what_its_wall_makes_room_for(sim):
     sim.advance_to(1.5 * BEAT)
     wide = int((sim.identities() >= 0).sum())
@@ -306,6 +307,7 @@ def test_a_clamped_wound_leaves_the_wall_as_it_was_and_moving(sim):
         assert a.tobytes() == b.tobytes()
 
 
+@pytest.mark.validation
 def test_a_still_wall_costs_no_field_and_does_not_move(scene):
     still = Simulation.from_scene(change(scene, wall=None))
     assert (

@@ -326,6 +326,7 @@ def test_a_clamp_on_a_wound_that_is_not_there_is_one_sentence(sim, wounds, has):
         assert str(error.value) == f"clamp: there is no wound {number}; there are {has}"
 
 
+@pytest.mark.validation
 def test_blood_leaves_through_a_wound_is_counted_and_no_faster_than_a_free_jet(sim):
     sim.advance_to(0.04)
     assert sim.outlets.outflow_counts()[2:].sum() == sim.outlets.outflow_counts()[2]
