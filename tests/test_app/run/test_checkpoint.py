@@ -72,8 +72,13 @@ def run_here(folder: Path, monkeypatch: pytest.MonkeyPatch, *command: str) -> Pa
 
 
 @pytest.mark.parametrize(
-    "model", ["pcnet", pytest.param("implicit", marks=pytest.mark.validation)]
-)  # the physics is killed
+    "model",
+    [
+        "physics",
+        pytest.param("pcnet", marks=pytest.mark.validation),
+        pytest.param("implicit", marks=pytest.mark.validation),
+    ],
+)
 def test_a_resumed_run_ends_bitwise_like_one_that_was_not_interrupted(
     box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:

@@ -287,6 +287,7 @@ def test_the_command_offers_what_there_is_and_refuses_too_short_a_time():
     assert "--until 0.001" in message
 
 
+@pytest.mark.validation
 def test_a_run_takes_what_is_advised(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -153,6 +153,7 @@ def test_quick_has_one_start_short_cases_and_the_models_of_run(tmp_path):
     assert len(jobs) < len(select_jobs(3, False, "", [], "cpu")) / 2
 
 
+@pytest.mark.validation
 def test_the_command_measures_and_draws(tmp_path):
     out, picture = tmp_path / "s.csv", tmp_path / "s.png"
     asked = ("stability", "--starts", "1", "--only", "implicit, one NaN", "--out", out)

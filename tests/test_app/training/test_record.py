@@ -130,6 +130,7 @@ def begun(scene_file: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return job.part.read_bytes()
 
 
+@pytest.mark.validation
 def test_killed_or_not_the_file_is_the_same_to_the_bit(
     recorded: Recording, begun: bytes, make: Maker, tmp_path: Path
 ) -> None:

@@ -356,6 +356,7 @@ def test_blood_leaves_through_a_wound_is_counted_and_no_faster_than_a_free_jet(s
     assert drops[:, 0].min() > RADIUS
 
 
+@pytest.mark.validation
 def test_a_clamp_stops_the_bleeding_whenever_it_comes_and_throws_nobody_out(sim):
     place = 2 + len(sim.vessel.openings)
     fastest = math.sqrt(2.0 * (PRESSURE / DENSITY + 9.81 * LENGTH))
