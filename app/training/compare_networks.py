@@ -40,7 +40,7 @@ class Variant:
 
 
 def linear(
-    course: TrainingRuns, settings: Settings, matrix: np.ndarray, offset: np.ndarray
+    runs: TrainingRuns, settings: Settings, matrix: np.ndarray, offset: np.ndarray
 ) -> Weights:
     """A direct network without hidden layers: a = matrix F + offset, both in R/T^2."""
     wide = 1e6 / CLIP  # nothing is clipped
@@ -49,27 +49,27 @@ def linear(
         np.zeros(PAPER_COUNT, np.float32),
         np.full(PAPER_COUNT, wide, np.float32),
         np.full(3, wide, np.float32),
-        course.training(settings, ""),
+        runs.training(settings, ""),
     )
 
 
-def persistence(course: TrainingRuns, settings: Settings) -> Weights:
+def persistence(runs: TrainingRuns, settings: Settings) -> Weights:
     """a_i^{n+1} = a_i^n."""
-    return linear(course, settings, np.eye(3, PAPER_COUNT), np.zeros(3))
+    return linear(runs, settings, np.eye(3, PAPER_COUNT), np.zeros(3))
 
 
-def ridge(course: TrainingRuns, settings: Settings) -> Weights:
+def ridge(runs: TrainingRuns, settings: Settings) -> Weights:
     """Ridge regression of the target on the 23 features, by their own deviations."""
-    features, target = course.examples(32)
+    features, target = runs.examples(32)
     x = features[:, :PAPER_COUNT].astype(np.float64)
     mean, deviation = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
     z = (x - mean) / deviation
-    y = target / course.scales.acceleration
+    y = target / runs.scales.acceleration
     weight = np.linalg.solve(
         z.T @ z + 1e-3 * len(z) * np.eye(PAPER_COUNT), z.T @ (y - y.mean(axis=0))
     )
     matrix = (weight / deviation[:, None]).T
-    return linear(course, settings, matrix, y.mean(axis=0) - matrix @ mean)
+    return linear(runs, settings, matrix, y.mean(axis=0) - matrix @ mean)
 
 
 DIRECT = Settings(head="direct")
@@ -170,19 +170,19 @@ def measure(job: Job) -> list[Row]:
     settings = replace(variant.settings, seed=job.seed, iterations=job.iterations)
     with Dataset(job.data) as file:
         last = len(file.runs) - 1
-        course = TrainingRuns(file, [0, last])
+        runs = TrainingRuns(file, [0, last])
         before = time.perf_counter()
         if variant.fit is None:
             with tempfile.TemporaryDirectory() as folder:
                 out = Path(folder) / "weights.npz"
                 weights, _ = train_weights(
-                    course, out, settings, report=lambda at: report(at.iteration / job.iterations)
+                    runs, out, settings, report=lambda at: report(at.iteration / job.iterations)
                 )
         else:
-            weights = variant.fit(course, settings)
+            weights = variant.fit(runs, settings)
         trained = time.perf_counter() - before
-        run = course.held[-1]
-        figures = course.rollout(course.pcnet(weights), run)
+        run = runs.held[-1]
+        figures = runs.rollout(runs.pcnet(weights), run)
         return [
             Row(
                 rung=job.variant,

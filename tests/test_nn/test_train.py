@@ -52,7 +52,7 @@ def stage() -> ReplaySimulation:
 
 
 @pytest.fixture(scope="module")
-def course(recorded: Path) -> Iterator[TrainingRuns]:
+def runs(recorded: Path) -> Iterator[TrainingRuns]:
     """One for all trainings: each new one compiles everything again."""
     with Dataset(recorded) as file:
         yield TrainingRuns(file, [0])
@@ -95,18 +95,18 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     assert np.abs(found - expected).max() < CLOSE[precision] * scale
 
 
-def one_step_error(course: TrainingRuns, weights: Weights) -> float:
+def one_step_error(runs: TrainingRuns, weights: Weights) -> float:
     """Root mean square error of the acceleration over the held-out run [m/s^2]."""
-    run, net, wrong = course.held[0], course.pcnet(weights), []
-    particles = course.replay.simulation.particles
+    run, net, wrong = runs.held[0], runs.pcnet(weights), []
+    particles = runs.replay.simulation.particles
     for frame in range(20, len(run), 8):
-        course.put(run, frame)
-        course.replay.simulation.model = net
+        runs.put(run, frame)
+        runs.replay.simulation.model = net
         net.accelerate(
             particles,
-            course.replay.simulation.wall,
-            course.replay.simulation.neighbors,
-            course.scene.gravity,
+            runs.replay.simulation.wall,
+            runs.replay.simulation.neighbors,
+            runs.scene.gravity,
         )
         n = particles.count[None]
         identity = particles.identity.to_numpy()[:n]
@@ -120,10 +120,10 @@ SETTINGS = Settings(iterations=40, validate_every=10)
 
 
 @pytest.fixture(scope="module")
-def trained(course: TrainingRuns, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(runs: TrainingRuns, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of a short training."""
     out = tmp_path_factory.mktemp("trained") / "whole.npz"
-    _, history = train_weights(course, out, SETTINGS, report=quiet)
+    _, history = train_weights(runs, out, SETTINGS, report=quiet)
     assert [row["iteration"] for row in history] == [10, 20, 30, 40]
     return out
 
@@ -133,14 +133,14 @@ def quiet(_: Progress) -> None:
 
 
 @pytest.mark.validation
-def test_training_learns_and_its_weights_run(course: TrainingRuns, trained: Path):
+def test_training_learns_and_its_weights_run(runs: TrainingRuns, trained: Path):
     weights = Weights.load(trained)
-    learned = one_step_error(course, weights)
+    learned = one_step_error(runs, weights)
     # What needs no training: a straight line through the 23 features, and nothing at all.
-    straight = one_step_error(course, ridge(course, Settings(head="direct")))
-    nothing = one_step_error(course, persistence(course, Settings(head="direct")))
+    straight = one_step_error(runs, ridge(runs, Settings(head="direct")))
+    nothing = one_step_error(runs, persistence(runs, Settings(head="direct")))
     assert learned < 0.7 * min(straight, nothing)
-    figures = course.rollout(course.pcnet(weights), course.held[0])
+    figures = runs.rollout(runs.pcnet(weights), runs.held[0])
     assert figures["survived"] == 1.0
     # Blood that stands has compression from its own weight, g h/c^2 = 0.1 %, and from the layers'
     # settling; it must not collapse.
@@ -164,7 +164,7 @@ class KilledError(Exception):
 
 
 @pytest.mark.validation
-def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, trained, tmp_path):
+def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(runs, trained, tmp_path):
     cut = tmp_path / "cut.npz"
 
     def kill(at: Progress) -> None:
@@ -172,12 +172,12 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, traine
             raise KilledError
 
     with pytest.raises(KilledError):
-        train_weights(course, cut, SETTINGS, report=kill)
+        train_weights(runs, cut, SETTINGS, report=kill)
     checkpoint = tmp_path / "cut.npz.checkpoint"
     other = Settings(iterations=40, validate_every=10, seed=1)
     with pytest.raises(InputError, match=r"cut.npz.checkpoint: holds a training with seed 0"):
-        train_weights(course, cut, other, report=quiet)
-    weights, history = train_weights(course, cut, SETTINGS, report=quiet)
+        train_weights(runs, cut, other, report=quiet)
+    weights, history = train_weights(runs, cut, SETTINGS, report=quiet)
     assert not checkpoint.exists()
     assert [row["iteration"] for row in history] == [10, 20, 30, 40]
     expected = Weights.load(trained)
@@ -186,36 +186,36 @@ def test_a_training_that_is_cut_short_goes_on_to_the_same_weights(course, traine
         np.testing.assert_array_equal(b, b_0)
     checkpoint.write_bytes(b"PK")
     with pytest.raises(InputError, match="not a checkpoint, or a cut one"):
-        train_weights(course, cut, SETTINGS, report=quiet)
+        train_weights(runs, cut, SETTINGS, report=quiet)
 
 
 @pytest.mark.validation
-def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(course):
+def test_a_rollout_keeps_time_where_steps_are_shorter_than_frames(runs):
     """The physics takes four steps a frame; rolled out from the first frame it is the recording."""
-    figures = course.rollout(course.replay.physics, course.held[0])
+    figures = runs.rollout(runs.replay.physics, runs.held[0])
     assert figures["survived"] == 1.0
     # Of a way of some tenths of a spacing; behind in time by half it would be 0.75 off.
     assert figures["path_error"] < 0.1
 
 
 @pytest.mark.validation
-def test_ridge_finds_a_straight_line(course, monkeypatch):
+def test_ridge_finds_a_straight_line(runs, monkeypatch):
     """Targets that are linear in the features, with an offset, are met nearly exactly."""
-    features, _ = course.examples(32)
+    features, _ = runs.examples(32)
     spread = features[:, :PAPER_COUNT].std(axis=0, keepdims=True).T.clip(1e-3)
     line = np.random.default_rng(0).normal(size=(PAPER_COUNT, 3)) / spread
-    target = (features[:, :PAPER_COUNT] @ line + 3.0) * course.scales.acceleration
-    monkeypatch.setattr(course, "examples", lambda _: (features, target))
-    weights = ridge(course, Settings(head="direct"))
-    found = weights.evaluate(features[:, :PAPER_COUNT]) * course.scales.acceleration
+    target = (features[:, :PAPER_COUNT] @ line + 3.0) * runs.scales.acceleration
+    monkeypatch.setattr(runs, "examples", lambda _: (features, target))
+    weights = ridge(runs, Settings(head="direct"))
+    found = weights.evaluate(features[:, :PAPER_COUNT]) * runs.scales.acceleration
     # The penalty is a thousandth of a feature's variance.
     assert np.abs(found - target).max() < 0.02 * np.abs(target - target.mean(axis=0)).max()
 
 
 @pytest.mark.validation
-def test_persistence_gives_back_the_previous_acceleration(course):
-    weights = persistence(course, Settings(head="direct"))
-    features, _ = course.examples(1)
+def test_persistence_gives_back_the_previous_acceleration(runs):
+    weights = persistence(runs, Settings(head="direct"))
+    features, _ = runs.examples(1)
     np.testing.assert_allclose(
         weights.evaluate(features[:, :PAPER_COUNT]), features[:, :3], rtol=1e-4, atol=1e-9
     )
