@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -67,6 +67,28 @@ def check_output(path: Path, option: str, begins: bytes) -> None:
                 pass
     except OSError as error:
         raise InputError(f"{option} {path}: cannot be written: {error.strerror}") from None
+
+
+def check_json(path: Path, option: str, keys: Iterable[str]) -> None:
+    """Refuse an output path that cannot be written, or holds other JSON than the keys are of.
+
+    Args:
+        path: where the file is to be.
+        option: what the message calls it.
+        keys: that every such file has had.
+
+    Raises:
+        InputError: the path is of no use.
+    """
+    check_output(path, option, b"{")
+    if not path.is_file() or not path.stat().st_size:
+        return
+    try:
+        found = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        found = {}
+    if not set(keys) <= found.keys():
+        raise InputError(f"{option} {path}: the file exists and is something else; name another")
 
 
 def _plain(value: Any) -> Any:

@@ -52,12 +52,12 @@ def bench(scenes: tuple[str, ...], json_file: Path | None, **given: Any) -> None
     Table 1 takes some ten minutes on two cores; what is being measured is told on the way.
     """
     from app.bench.benchmark import BenchOptions, run_bench
-    from app.files import check_output
+    from app.files import check_json
     from app.locks import claimed
     from app.scenes.library import scene_path
 
     if json_file is not None:
-        check_output(json_file, "--json", b"{")
+        check_json(json_file, "--json", ("machine", "rows"))
     wanted: list[tuple[Path, int | None]] = [(scene_path(name), None) for name in scenes]
     if not wanted:
         wanted = [(scene_path(name), count) for name in "AB" for count in (16000, 32000)]

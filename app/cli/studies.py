@@ -46,7 +46,7 @@ def compare(
     seed: int,
 ) -> None:
     """Pour a scene by physics and by networks side by side, and measure the difference."""
-    from app.files import check_output
+    from app.files import check_json
     from app.locks import claimed
     from app.scenes.library import find_scene, weights_for, with_column
     from app.studies import compare as comparison
@@ -55,7 +55,7 @@ def compare(
 
     found = with_column(find_scene(scene), particles, height)
     if json_file is not None:
-        check_output(json_file, "--json", b"{")
+        check_json(json_file, "--json", ("scene", "results"))
     check_plot(plot)
     with claimed(json_file, "--json"), claimed(plot, "--plot"):
         start(arch, "f32", threads, random_seed=seed)

@@ -5,7 +5,6 @@ observer that writes it.
 """
 
 import contextlib
-import json
 import shlex
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.files import check_output, write_json
+from app.files import check_json, check_output, write_json
 from app.locks import claimed
 from app.run.checkpoint import Checkpointer
 from app.run.loop import Observer, Outcome, Summary
@@ -44,22 +43,12 @@ def _begins(content: bytes) -> Callable[[Path, str], None]:
     return lambda path, option: check_output(path, option, content)
 
 
-def check_summary(path: Path, option: str) -> None:
-    """Refuse a path that holds something else than a summary.
+SUMMARY_KEYS = ("scene", "steps", "simulated_time", "ending")
+"""What the first summaries had already."""
 
-    Raises:
-        InputError: the path is of no use.
-    """
-    check_output(path, option, b"{")
-    if not path.is_file() or not path.stat().st_size:
-        return
-    try:
-        found = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
-        found = {}
-    # What the first summaries had already.
-    if not {"scene", "steps", "simulated_time", "ending"} <= found.keys():
-        raise InputError(f"{option} {path}: the file exists and is no summary; name another")
+
+def _is_summary(path: Path, option: str) -> None:
+    check_json(path, option, SUMMARY_KEYS)
 
 
 def _view(
@@ -95,7 +84,7 @@ OUTPUTS = {
     "view": Output("--rrd", lambda options, _: options.rrd, _begins(b"RRF2"), _view),
     # Last of the observers: what came before it is safe by then.
     "checkpoint": Output("--checkpoint", RunOptions.checkpoint_file, _begins(b"PK"), _checkpointer),
-    "summary": Output("--summary", lambda options, _: options.summary, check_summary),
+    "summary": Output("--summary", lambda options, _: options.summary, _is_summary),
 }
 """Outputs by name, in the order in which they see a frame.  The session is an observer too: who
 makes it (`app.run_scene`, `app.control`) puts it first."""

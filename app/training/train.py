@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.files import check_output, require_matplotlib, write_json
+from app.files import check_json, check_output, require_matplotlib, write_json
 from app.progress import duration
 from taichi_sph.errors import InputError
 
@@ -47,7 +47,7 @@ def train(
     check_plot(plot)
     check_output(out, "--out", b"PK")
     curves = out.with_suffix(".history.json")
-    check_output(curves, "--out", b"{")
+    check_json(curves, "--out", ("command", "validations"))
 
     from nn.dataset.reader import Dataset
     from nn.training.runs import TrainingRuns

@@ -392,3 +392,19 @@ def test_the_version_is_that_of_the_project() -> None:
         pytest.skip("vesselflow is not installed here; make test installs it")
     text = (ROOT / "pyproject.toml").read_text()
     assert f'version = "{done.stdout.split()[-1]}"' in text
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("bench", "box", "--json"),
+        ("compare", "box", "--json"),
+        ("run", "box", "--frames", "1", "--summary"),
+    ],
+)
+def test_json_of_another_program_is_not_replaced(command: tuple[str, ...], tmp_path: Path) -> None:
+    file = tmp_path / "package.json"
+    file.write_text('{"name": "mine", "scene": 1, "rows": []}')
+    message, code = invoke([*command, str(file)])
+    assert code == 2 and str(file) in message
+    assert file.read_text().startswith('{"name": "mine"')
