@@ -15,13 +15,14 @@ from taichi_sph.boundary.boundary import BloodFlow
 from taichi_sph.fluid.calibration import calibrate
 from taichi_sph.fluid.equation_of_state import Tait
 from taichi_sph.fluid.model import Fluid
-from taichi_sph.fluid.rheology import Casson, Newtonian
+from taichi_sph.fluid.rheology import Casson, Newtonian, make_rheology
 from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.particles.grid import make_grid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
+from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 
 DENSITY = 1060.0
@@ -66,6 +67,17 @@ class Liquid:
     artificial_viscosity: float = 0.0
     """Monaghan's alpha [-]."""
     nested: bool = False
+    courant_number: float = 0.4
+
+    @classmethod
+    def of_scene(cls, scene: Scene, sound_speed: float) -> "Liquid":
+        """The blood of a scene, as it is poured at a sound speed [m/s]."""
+        grid, blood = scene.discretization, scene.blood
+        return cls(
+            make_rheology(blood.rheology), sound_speed, grid.spacing, grid.support_ratio,
+            grid.wall_spacing_ratio, artificial_viscosity=blood.artificial_viscosity,
+            nested=grid.viscous_form == "nested", courant_number=grid.courant_number,
+        )  # fmt: skip
 
     @property
     def kernel(self) -> WendlandC2:
@@ -86,6 +98,7 @@ class Liquid:
             calibration=calibrate(self.kernel, self.spacing, self.wall_spacing, DENSITY),
             artificial_viscosity=self.artificial_viscosity,
             nested=self.nested,
+            courant_number=self.courant_number,
         )
 
 

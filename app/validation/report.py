@@ -3,7 +3,8 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,11 @@ class Row:
     def passed(self) -> bool:
         """Whether the error is within the tolerance; a NaN is not."""
         return self.error <= self.tolerance
+
+    @property
+    def as_json(self) -> dict[str, Any]:
+        """What `validate --json` keeps of it."""
+        return asdict(self) | {"passed": self.passed}
 
     @property
     def verdict(self) -> str:

@@ -12,8 +12,9 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 from rich.text import Text
 
-from app.files import check_plots, console
-from app.validation import boundaries, pipes, statics, viscosity
+from app import version
+from app.files import check_json, check_plots, console, write_json
+from app.validation import boundaries, delivered, pipes, statics, viscosity
 from app.validation.report import Report, Row
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.runtime import start
@@ -28,12 +29,15 @@ class Case:
     precision: str
     run: Callable[[Report, bool], None]
     """Takes the report and whether to be quick."""
+    minutes: int = 0
+    """How long it takes on two cores, if it is run only when it is named or quick."""
 
 
 CASES = (
     Case("kernel", "kernel integrals", "f64", statics.kernel_integrals),
     Case("momentum", "momentum in a closed box", "f64", statics.momentum),
     Case("shear_wave", "shear wave", "f32", viscosity.shear_wave),
+    Case("viscosity", "viscosity delivered in scenes", "f32", delivered.delivered_viscosity, 20),
     Case("taylor_green", "Taylor-Green vortices", "f32", viscosity.taylor_green),
     Case("hydrostatic", "hydrostatic column", "f32", statics.hydrostatic),
     Case("poiseuille", "Poiseuille flow in a tube", "f32", pipes.poiseuille),
@@ -114,15 +118,17 @@ def main(
     quick: bool = False,
     arch: str = "cpu",
     threads: int | None = None,
+    json_file: Path | None = None,
 ) -> int:
     """Run the cases, print the table and, if asked, draw the profiles.
 
     Args:
-        only: names of cases; all by default.
+        only: names of cases; all that take no long time by default.
         plot: folder for pictures, made if it is not there.
         quick: coarser and fewer, under a minute on two cores.
         arch: "cpu" or "gpu".
         threads: CPU threads.
+        json_file: gets the rows.
 
     Returns:
         0 if every row is within its tolerance or known to miss, else 1.
@@ -136,6 +142,9 @@ def main(
         raise InputError(f"validate {unknown[0]}: no such case; allowed are {', '.join(names)}")
     if plot is not None:
         check_plots(plot)
+    if json_file is not None:
+        check_json(json_file, "--json", ("version", "rows"))
+    chosen = [c for c in CASES if (c.name in only if only else quick or not c.minutes)]
     rows: list[Row] = []
     files: list[Path] = []
     progress = Progress(
@@ -144,7 +153,7 @@ def main(
     )  # fmt: skip
     begin = time.perf_counter()
     with progress:
-        for case in (c for c in CASES if not only or c.name in only):
+        for case in chosen:
             task = progress.add_task(case.title, total=1.0)
 
             def advance(fraction: float, task: TaskID = task) -> None:
@@ -158,13 +167,22 @@ def main(
     terminal = console()
     terminal.print(table_of(rows))
     verdicts = Counter(row.verdict for row in rows)
-    known = "".join(f"; known to miss: {r.quantity}: {r.known}" for r in rows
-                    if r.verdict == "known miss")  # fmt: skip
     terminal.print(
-        f"{verdicts['pass']} of {len(rows)} rows within tolerance{known}; "
+        f"{verdicts['pass']} of {len(rows)} rows within tolerance; "
         f"{time.perf_counter() - begin:.0f} s",
         soft_wrap=True,
     )
+    for row in rows:
+        if row.verdict == "known miss":
+            terminal.print(f"known to miss: {row.quantity}: {row.known}", soft_wrap=True)
+    for case in CASES:
+        if not only and case not in chosen:
+            terminal.print(
+                f"left out, for it takes some {case.minutes} min: vesselflow validate {case.name}",
+                soft_wrap=True,
+            )
+    if json_file is not None:
+        write_json(json_file, {"version": version(), "rows": [row.as_json for row in rows]})
     for file in files:
         terminal.print(f"picture {file}", soft_wrap=True)
     return 1 if verdicts["MISS"] else 0

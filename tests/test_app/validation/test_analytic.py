@@ -211,3 +211,27 @@ def test_the_measured_front_starts_at_the_dam_and_only_advances():
     assert (np.diff(front) > 0.0).all()
     # Slower than the thin tongue of Ritter's ideal dam break, 2 sqrt(2) per unit of this time.
     assert np.diff(front).max() / (t[1] - t[0]) < 2.0 * math.sqrt(2.0)
+
+
+def test_a_shear_wave_of_a_newtonian_liquid_decays_exponentially():
+    k, mu, rho = 200.0, 3.5e-3, 1060.0
+    time = 0.5 / analytic.shear_wave_rate(k, mu, rho)
+    left = analytic.shear_wave_decay(k, 0.3, lambda _: mu, rho, time)
+    assert left == pytest.approx(math.exp(-0.5), rel=2e-4)
+
+
+def test_a_shear_wave_of_casson_blood_decays_between_those_of_its_least_and_largest_viscosity():
+    k, rho, eta, tau_y, n = 200.0, 1060.0, 3.5e-3, 5e-3, 1.0
+    time = 0.2 / analytic.shear_wave_rate(k, eta, rho)
+
+    def left(speed: float) -> float:
+        def law(g: float) -> float:
+            return analytic.regularised_casson(g, eta, tau_y, n)
+
+        return analytic.shear_wave_decay(k, speed, law, rho, time)
+
+    # The faster, the nearer to eta; the slower, the nearer to the plateau.
+    plateau = analytic.regularised_casson(0.0, eta, tau_y, n)
+    assert left(100.0) == pytest.approx(math.exp(-0.2), rel=0.02)
+    assert left(1e-8) == pytest.approx(math.exp(-0.2 * plateau / eta), rel=0.02)
+    assert left(1e-8) < left(1e-2) < left(0.3) < left(100.0)

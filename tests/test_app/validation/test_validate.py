@@ -1,5 +1,6 @@
 """The command `vesselflow validate` itself; its physics is in tests/validation."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,33 @@ def test_only_a_miss_that_is_not_known_fails(known, code, monkeypatch, capsys):
     monkeypatch.setattr("app.validation.validate.CASES", (Case("one", "a case", "f32", run),))
     assert main() == code
     assert ("known to miss: speed: too coarse" in capsys.readouterr().out) == (code == 0)
+
+
+def test_a_long_case_runs_when_it_is_named_and_rows_go_to_a_file(monkeypatch, capsys, tmp_path):
+    ran = []
+
+    def run(name):
+        def case(report, quick):
+            ran.append(name)
+            report.compare("speed", 1.02, 1.0, 0.05)
+
+        return case
+
+    cases = (Case("one", "a case", "f32", run("one")), Case("two", "long", "f32", run("two"), 30))
+    monkeypatch.setattr("app.validation.validate.start", lambda *_: None)
+    monkeypatch.setattr("app.validation.validate.CASES", cases)
+    out = tmp_path / "rows.json"
+    assert main(json_file=out) == 0
+    assert ran == ["one"]
+    assert "30 min: vesselflow validate two" in capsys.readouterr().out
+    assert main(["two"], json_file=out) == 0
+    assert ran == ["one", "two"]
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["quantity"] == "speed" and row["passed"] is True and row["tolerance"] == 0.05
+    out.write_text('{"mine": 1}')
+    with pytest.raises(InputError, match="something else; name another"):
+        main(["two"], json_file=out)
+    assert out.read_text() == '{"mine": 1}'
 
 
 def test_the_relative_error_is_of_the_norms():
