@@ -105,6 +105,11 @@ class Outcome:
 class _Stop(BaseException):
     """Ctrl-C or SIGTERM came while the simulation was advancing."""
 
+    def __init__(self, number: int):
+        """`number` is the signal's."""
+        super().__init__(number)
+        self.signal = number
+
 
 class _Signals:
     """SIGINT and SIGTERM as an orderly end; a second one ends at once."""
@@ -117,7 +122,7 @@ class _Signals:
         self.received = number
         signal.signal(number, signal.SIG_DFL)
         if self._interruptible:
-            raise _Stop
+            raise _Stop(number)
 
     @contextmanager
     def caught(self) -> Iterator[None]:
@@ -136,7 +141,7 @@ class _Signals:
     def interruptible(self) -> Iterator[None]:
         """A signal in here raises; elsewhere it waits, so that no output is cut in two."""
         if self.received is not None:
-            raise _Stop
+            raise _Stop(self.received)
         self._interruptible = True
         try:
             yield
@@ -175,9 +180,8 @@ def drive(
         the summary; with the error of a run that diverged or could not write its output, or the
         signal that ended it.
     """
-    signals = _Signals()
+    signals, stopped = _Signals(), None
     error: RunError | OSError | None = None
-    stopped: int | None = None
     step_times: list[float] = []
     most_leaks, most_compression = 0, 0.0
     began, first_time = time.perf_counter(), simulation.time
@@ -205,11 +209,10 @@ def drive(
                 figures = simulation.diagnostics()
                 steps = simulation.steps
                 frame += 1
-            drained = figures.particles == 0 and figures.time < until
-            ending = "all blood has left the vessel" if drained else "finished"
-        except _Stop:
-            stopped = signals.received
-            assert stopped is not None
+            empty = figures.particles == 0 and figures.time < until
+            ending = "all blood has left the vessel" if empty else "finished"
+        except _Stop as stop:
+            stopped = stop.signal
             ending = f"stopped by {signal.Signals(stopped).name}"
         except (RunError, OSError) as caught:
             error, ending = caught, str(caught)
