@@ -253,7 +253,7 @@ class Simulation:
         """Go on from a state of the same scene, under a model of the name that it has.
 
         Raises:
-            InputError: it is of other boundaries, or there is no room for so many.
+            InputError: it is of other boundaries, or there is no room for so many; nothing changes.
         """
         self._require_runtime()
         n, capacity = len(state.particles["identity"]), self.particles.capacity
@@ -263,10 +263,17 @@ class Simulation:
                 f"a state of {n} particles with {', '.join(unknown) or 'nothing'} that the scene "
                 f"has not; there is room for {capacity}"
             )
+        before = self.save_state()
+        try:
+            self._load(state)
+        except InputError:
+            self._load(before)
+            raise
+
+    def _load(self, state: State) -> None:
         self.particles.replace(state.particles)
-        self.time, self.last_step, self.fallback_time = (
-            state.time, state.last_step, state.fallback_time
-        )  # fmt: skip
+        self.time, self.last_step = state.time, state.last_step
+        self.fallback_time = state.fallback_time
         self.steps, self.wall_corrections = state.steps, state.wall_corrections
         self.gravity = state.gravity
         self.neighbors.stale = True
@@ -308,8 +315,6 @@ class Simulation:
             for boundary in self.boundaries:
                 boundary.compile_kernels(model)
         self.neighbors.stale = True
-
-    # Boundaries by name
 
     @property
     def outlets(self) -> Outlets:

@@ -7,6 +7,7 @@ from bleeding_tube import HOLE, LENGTH, SIDE, D, assert_account_is_whole, assert
 from states import through_a_file
 from taichi_sph.boundary.outlets import DROPLET_TIME, SUCTION
 from taichi_sph.boundary.wounds import LEAST_RADIUS
+from taichi_sph.errors import InputError
 from taichi_sph.simulation import Simulation
 
 
@@ -133,3 +134,15 @@ def test_no_blood_begins_in_the_tool(sim):
     clear = np.linalg.norm(lattice - [0.0, 0.0, -5e-3], axis=1) > 2e-3 + 0.5 * D
     inside = np.abs(x[:, 2]) < 0.5 * LENGTH
     assert inside.sum() == clear.sum()
+
+
+def test_a_state_that_is_refused_changes_nothing(sim):
+    sim.advance_to(0.002)
+    before, _ = state_of(sim)
+    other = sim.save_state()
+    other.particles["position"][:] += 1e-3
+    other.boundaries["inflow"]["openings"].pop()
+    with pytest.raises(InputError, match="a state of 0 driven openings: the scene has 1"):
+        sim.load_state(other)
+    assert sim.time == 0.002
+    assert_same(state_of(sim)[0], before)
