@@ -82,11 +82,11 @@ def run_here(folder: Path, monkeypatch: pytest.MonkeyPatch, *command: str) -> Pa
 def test_a_resumed_run_ends_bitwise_like_one_that_was_not_interrupted(
     box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    whole = run_here(tmp_path / "whole", monkeypatch, *arguments(box, model, 8))
-    half = run_here(tmp_path / "half", monkeypatch, *arguments(box, model, 3))
-    assert Checkpoint.read(half).frame == 3
+    whole = run_here(tmp_path / "whole", monkeypatch, *arguments(box, model, 4))
+    half = run_here(tmp_path / "half", monkeypatch, *arguments(box, model, 2))
+    assert Checkpoint.read(half).frame == 2
     assert not same(half, whole)
-    run_here(half.parent, monkeypatch, *arguments(box, model, 8), "--resume", str(half))
+    run_here(half.parent, monkeypatch, *arguments(box, model, 4), "--resume", str(half))
     assert same(half, whole)
 
 

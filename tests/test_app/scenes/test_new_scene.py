@@ -232,7 +232,9 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["my.stl", "taken"]
 
 
-@pytest.mark.parametrize("name", ["aortoiliac", "carotid_siphon"])
+@pytest.mark.parametrize(
+    "name", ["aortoiliac", pytest.param("carotid_siphon", marks=pytest.mark.validation)]
+)
 @pytest.mark.parametrize("kind", ["capped", "wall"])
 def test_real_surfaces_become_scenes(tmp_path: Path, name: str, kind: str) -> None:
     path = REAL / f"{name}_{kind}.stl"

@@ -81,6 +81,7 @@ def recorded(make: Maker, tmp_path_factory: pytest.TempPathFactory) -> Recording
     return make(HEIGHTS, FRAMES, out, processes=2, threads=1)
 
 
+@pytest.mark.validation
 def test_a_state_says_all_that_its_future_needs(scene_file: Path) -> None:
     scene = read_scene(scene_file)
     simulation = ReplaySimulation(scene, read_vessel(scene), 0)

@@ -185,6 +185,7 @@ def assert_account_is_whole(sim: Simulation, initial: int) -> None:
     assert len(np.unique(names)) == len(names)
 
 
+@pytest.mark.validation
 def test_the_account_closes_and_what_is_added_is_what_the_pump_pushes(driven):
     initial = driven.particles.count[None]
     names = set(driven.identities().tolist())
