@@ -8,16 +8,12 @@ import click
 from app.cli import options
 from app.cli.options import output_path
 
-json_file = click.option(
-    "--json", "json_file", type=output_path, metavar="FILE", help="Write figures as JSON."
-)
-
 
 @click.command()
 @click.argument("cases", metavar="[CASE]...", nargs=-1)
 @click.option("--plot", type=output_path, metavar="FOLDER", help="Draw the profiles there.")
 @click.option("--quick", is_flag=True, help="Coarser and fewer cases.")
-@json_file
+@options.json_file
 @options.machine
 def validate(
     cases: tuple[str, ...], plot: Path | None, quick: bool, json_file: Path | None, arch: str,
@@ -54,7 +50,7 @@ def validate(
 @click.option(
     "--plot", type=output_path, metavar="FOLDER", help="Draw --split and --real-time there."
 )
-@json_file
+@options.json_file
 def bench(scenes: tuple[str, ...], json_file: Path | None, **given: Any) -> None:
     """Measure the speed on scenes; without any, the paper's Table 1: A and B, 16 000 and 32 000.
 

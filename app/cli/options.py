@@ -64,6 +64,9 @@ scheduler = click.option(
     metavar="dask:ADDRESS",
     help="Scheduler of a Dask cluster that does the work.  [default: this machine does]",
 )
+json_file = click.option(
+    "--json", "json_file", type=output_path, metavar="FILE", help="Write figures as JSON."
+)
 colour = click.option(
     "--colour",
     type=click.Choice(["speed", "age"]),

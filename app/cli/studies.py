@@ -28,7 +28,7 @@ from app.cli.options import output_path, positive
 @options.particles
 @options.height
 @options.until
-@click.option("--json", "json_file", type=output_path, metavar="FILE", help="Write figures.")
+@options.json_file
 @options.plot("the curves")
 @options.machine
 @options.seed

@@ -97,12 +97,12 @@ COLOURINGS = ("speed", "age")
 def colouring(of: str, simulation: "Simulation") -> Colouring:
     """The colouring of a simulation's blood by one of COLOURINGS."""
     if of == "age":
-        return Colouring(of, AGE_COLOURS, _old(simulation), "s", "new")
+        return Colouring(of, AGE_COLOURS, _largest_age(simulation), "s", "new")
     # Free fall over the whole height, or what drives: little is faster.
     return Colouring(of, SPEED_COLOURS, simulation.derived.expected_speed or 1.0, "m/s", "at rest")
 
 
-def _old(simulation: "Simulation") -> float:
+def _largest_age(simulation: "Simulation") -> float:
     """An age that little blood outlives [s]: twice V/Q of what is pumped in, or the duration."""
     duration = simulation.scene.duration
     flows = [o.flow * o.waveform.mean for o in simulation.inflow.openings if o.flow is not None]

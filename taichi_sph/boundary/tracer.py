@@ -147,10 +147,12 @@ class Tracer(Boundary):
         }
 
     def load_state(self, saved: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Go on from a saved state; of one without ages blood ages from its time on."""
+        self.reset()
         self._inlet[:] = saved["inlet"]
-        self._aged_until = saved["aged_until"]
-        self.age_sum.from_numpy(np.asarray(saved["age_sum"]))
+        if "aged_until" in saved:
+            self._aged_until = saved["aged_until"]
+            self.age_sum.from_numpy(np.asarray(saved["age_sum"]))
 
 
 def _require_concentration(concentration: float) -> None:

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from app.cli import invoke
+from app.cli.run import replay
+from app.cli.run import run as run_command
 from app.scenes.library import shipped
+from app.view.appearance import COLOURINGS
 from fake_simulation import FakeSimulation
 from places import ROOT
 from recordings import environment, positions, verify
@@ -392,6 +395,13 @@ def test_the_version_is_that_of_the_project() -> None:
         pytest.skip("vesselflow is not installed here; make test installs it")
     text = (ROOT / "pyproject.toml").read_text()
     assert f'version = "{done.stdout.split()[-1]}"' in text
+
+
+def test_what_colours_may_mean_is_what_pictures_know() -> None:
+    # A list of its own, for options are read without numpy.
+    for command in (run_command, replay):
+        (colour,) = (option for option in command.params if option.name == "colour")
+        assert tuple(colour.type.choices) == COLOURINGS  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

@@ -555,12 +555,12 @@ def use_every_control(browser: Browser, page: ControlPage, session: Any) -> None
     last("dye", opening=session.driven[1], concentration=0.0)
 
     # Speeds swirl along z; by age, colours follow the particles' numbers.
-    by_speed = page._scene._blood.colors
+    oldest = [0xFD, 0xE7, 0x25]
     browser.choose("colour", "age")
-    wait_until(lambda: page._scene._blood.colors[-1].tolist() == [0xFD, 0xE7, 0x25])
+    wait_until(lambda: page._scene._blood.colors[-1].tolist() == oldest)
     browser.find("//*[contains(., 's and above') and not(contains(., 'm/s and above'))]")
     browser.choose("colour", "speed")
-    wait_until(lambda: len(page._scene._blood.colors) == len(by_speed))
+    wait_until(lambda: page._scene._blood.colors[-1].tolist() != oldest)
 
     # A click beside the vessel leaves the marker where it is.
     before = np.array(page.wound_marker.position)

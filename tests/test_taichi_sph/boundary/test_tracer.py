@@ -153,3 +153,15 @@ def test_a_state_keeps_ages_and_those_of_what_has_left_and_a_reset_begins_anew(d
     driven.advance_to(0.11)
     assert driven.save_state().particles["age"].tobytes() == first.tobytes()
     np.testing.assert_array_equal(tracer_of(driven).mean_age(), mean)
+
+
+def test_a_state_from_before_there_was_age_is_gone_on_with(driven):
+    driven.advance_to(0.08)
+    state = driven.save_state()
+    for key in ("aged_until", "age_sum"):
+        del state.boundaries["tracer"][key]
+    del state.particles["age"]
+    driven.advance_to(0.1)
+    driven.load_state(state)
+    driven.advance_to(0.085)
+    assert 0.0 < driven.particles.rows()["age"].max() <= 0.005 * (1.0 + 1e-5)
