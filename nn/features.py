@@ -36,7 +36,17 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from taichi_sph.fluid.density import density_of, density_rate, density_response, pair_gradient
+from taichi_sph.fluid.density import (
+    concentration_gradient,
+    density_of,
+    density_rate,
+    density_response,
+    pair_crowding,
+    pair_gradient,
+    velocity_gradient_of,
+)
+from taichi_sph.fluid.rheology import shear_rate
+from taichi_sph.fluid.shifting import shifting_velocity
 from taichi_sph.particles.wall import wall_velocity
 
 ACCELERATION, NEIGHBOURS, POSITION, VELOCITY = 0, 3, 4, 7
@@ -172,15 +182,17 @@ def blood_features(
 ):
     """Write rows 3 to 15 of particle i; lengths in R, velocities in U.
 
-    Returns: sum_j W_ij, W(0) included, sum_j v_ij.grad W_ij, sum_j grad W_ij, sum_j |grad W_ij|^2.
+    Returns: sum_j W_ij, W(0) included, sum_j v_ji grad W_ij, sum_j grad W_ji, sum_j |grad W_ij|^2
+    and sum_j f_ij grad W_ji.
     """
     x_i = p.position[i]
     v_i = p.velocity[i]
     per_length = ti.static(1.0 / scales.support_radius)
     per_speed = ti.static(1.0 / scales.speed)
     blood = fluid.kernel.w(0.0)
-    rate = 0.0
+    velocity_gradient = ti.Matrix.zero(float, 3, 3)
     gradient = ti.Vector([0.0, 0.0, 0.0])
+    concentration = ti.Vector([0.0, 0.0, 0.0])
     square = 0.0
     n = 0.0
     r_sum = ti.Vector([0.0, 0.0, 0.0])
@@ -197,12 +209,11 @@ def blood_features(
             v_ji = (p.velocity[j] - v_i) * per_speed
             n += 1.0
             r = q * ti.static(scales.support_radius)
-            blood += fluid.kernel.w(r)
-            # r_ij.v_ij = r_ji.v_ji
-            rate_ij, gradient_ji, square_ij = pair_gradient(
-                fluid.kernel.slope(r), q * q, r_ji, v_ji
-            )
-            rate += rate_ij
+            w_ij = fluid.kernel.w(r)
+            blood += w_ij
+            _, gradient_ji, square_ij = pair_gradient(fluid.kernel.slope(r), q * q, r_ji, v_ji)
+            velocity_gradient -= v_ji.outer_product(gradient_ji)
+            concentration += pair_crowding(fluid, w_ij) * gradient_ji
             gradient += gradient_ji
             square += square_ij
             if ti.static(inputs.among(POSITION, POSITION + 1, POSITION + 2)):
@@ -232,7 +243,7 @@ def blood_features(
             put_moments(f, DISTANCE_SKEWNESS, DISTANCE_KURTOSIS, n, distance_bins)
         if ti.static(inputs.among(SPEED_SKEWNESS, SPEED_KURTOSIS)):
             put_moments(f, SPEED_SKEWNESS, SPEED_KURTOSIS, n, speed_bins)
-    return blood, rate, gradient, square
+    return blood, velocity_gradient, gradient, square, concentration
 
 
 @ti.func
@@ -248,11 +259,11 @@ def wall_features(
 ):
     """Write rows 16 to 22 of particle i; lengths in R.
 
-    Returns: sum_k V_k W_ik, sum_k V_k v_ki.grad W_ki with v_ki in m/s, and sum_k V_k grad W_ki.
+    Returns: sum_k V_k W_ik, sum_k V_k v_ki grad W_ik with v_ki in m/s, and sum_k V_k grad W_ki.
     """
     x_i = p.position[i]
     wall = 0.0
-    rate = 0.0
+    velocity_gradient = ti.Matrix.zero(float, 3, 3)
     gradient = ti.Vector([0.0, 0.0, 0.0])
     m = 0.0
     r_sum = ti.Vector([0.0, 0.0, 0.0])
@@ -267,10 +278,10 @@ def wall_features(
             r = q * ti.static(scales.support_radius)
             wall += w.volume[k] * fluid.kernel.w(r)
             slope = w.volume[k] * fluid.kernel.slope(r)
-            rate_k, gradient_k, _ = pair_gradient(slope, 0.0, r_ki, wall_velocity(w, k))
+            gradient_k = slope * r_ki
             gradient += gradient_k
             if ti.static(w.moves):
-                rate += rate_k
+                velocity_gradient -= wall_velocity(w, k).outer_product(gradient_k)
             if ti.static(inputs.among(PROXY_POSITION, PROXY_POSITION + 1, PROXY_POSITION + 2)):
                 r_sum += r_ki
             if ti.static(inputs.among(PROXY_VARIANCE)):
@@ -285,7 +296,7 @@ def wall_features(
         f[PROXY_VARIANCE] = ti.max(0.0, distance[1] / m - (distance[0] / m) ** 2)
         if ti.static(inputs.among(PROXY_SKEWNESS, PROXY_KURTOSIS)):
             put_moments(f, PROXY_SKEWNESS, PROXY_KURTOSIS, m, bins)
-    return wall, rate - p.velocity[i].dot(gradient), gradient
+    return wall, velocity_gradient + p.velocity[i].outer_product(gradient), gradient
 
 
 @ti.func
@@ -298,7 +309,7 @@ def features_of(
     scales: ti.template(),
     inputs: ti.template(),
 ):
-    """All rows of the table for particle i, dimensionless (its last column).
+    """All rows of the table for particle i, dimensionless (its last column); its shifting [m/s].
 
     Of the rows that a network may see, those that `inputs` leaves out are 0.
     Reads: position, velocity, acceleration.
@@ -308,16 +319,24 @@ def features_of(
         a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
         for a in ti.static(range(3)):
             f[ACCELERATION + a] = a_i[a]
-    blood, blood_rate, blood_gradient, square = blood_features(f, i, p, nb, fluid, scales, inputs)
-    wall, wall_rate, wall_gradient = wall_features(f, i, p, w, nb, fluid, scales, inputs)
+    blood, blood_rates, blood_gradient, square, crowding = blood_features(
+        f, i, p, nb, fluid, scales, inputs
+    )
+    wall, wall_rates, wall_gradient = wall_features(f, i, p, w, nb, fluid, scales, inputs)
     f[DENSITY_RATIO] = density_of(fluid, fluid.rest_density, blood, wall)
     f[COMPRESSION] = 50.0 * ti.max(0.0, f[DENSITY_RATIO] - 1.0)
-    rate = density_rate(fluid, blood_rate * ti.static(scales.speed), wall_rate)
+    # Lengths in the gradients are in R: each is R times what it gives, and R^2 D is R^4 times.
+    radius = ti.static(scales.support_radius)
+    blood_rates *= ti.static(scales.speed)
+    rate = -density_rate(fluid, blood_rates.trace(), wall_rates.trace())
     f[DIVERGENCE] = -rate * ti.static(scales.support_radius * scales.frame_interval)
-    # Lengths in the gradients are in R: R^2 D is R^4 times what they give.
+    sheared = radius * shear_rate(velocity_gradient_of(fluid, blood_rates, wall_rates))
+    concentration = -radius * concentration_gradient(fluid, crowding, wall_gradient)
+    steps = ti.static(1.0 / scales.frame_interval)
+    shifting = shifting_velocity(fluid, f[DENSITY_RATIO], sheared, concentration, steps)
     response = density_response(fluid, blood_gradient, wall_gradient, square)
     f[RESPONSE] = ti.static(scales.support_radius**4) * response
-    return f
+    return f, shifting
 
 
 @ti.kernel
@@ -331,6 +350,6 @@ def extract(
 ):
     """What `features_of` gives, for every live particle.  Writes: out[identity, ROW_COUNT]."""
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, fluid, scales, ALL)
+        f, _ = features_of(i, p, w, nb, fluid, scales, ALL)
         for k in ti.static(range(ROW_COUNT)):
             out[p.identity[i], k] = f[k]

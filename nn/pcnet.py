@@ -309,11 +309,11 @@ def predict_acceleration(
 ) -> int:
     """a_i^{n+1} = net(F_i) (paper, Algorithm 2); it knows gravity or nothing does.
 
-    Returns how many particles are beyond training.  Writes: out, density.
+    Returns how many particles are beyond training.  Writes: out, density, shifting.
     """
     alarms = 0
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, fluid, scales, network.inputs)
+        f, p.shifting[i] = features_of(i, p, w, nb, fluid, scales, network.inputs)
         alarms += beyond_training(f, p.velocity[i], scales)
         p.density[i] = f[DENSITY_RATIO] * ti.static(fluid.rest_density)
         o = evaluate(network, f)
@@ -352,14 +352,14 @@ def predict_pressure(
 ):
     """The pressure head's q^0, mu and T^2 rho_0 D.
 
-    Writes: pressure_term, viscosity, diagonal, density.
+    Writes: pressure_term, viscosity, diagonal, density, shifting.
     """
     rest_density = ti.static(fluid.rest_density)
     thickest = ti.static(
         LARGEST_VISCOSITY * fluid.rest_density * scales.support_radius * scales.speed_limit
     )
     for i in range(p.count[None]):
-        f = features_of(i, p, w, nb, fluid, scales, network.inputs)
+        f, p.shifting[i] = features_of(i, p, w, nb, fluid, scales, network.inputs)
         p.density[i] = f[DENSITY_RATIO] * rest_density
         diagonal[i] = ti.static(fluid.rest_density / scales.speed_limit**2) * ti.max(
             SMALLEST_DIAGONAL, f[RESPONSE]

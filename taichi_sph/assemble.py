@@ -274,6 +274,7 @@ def _make_fluid(plan: _Plan, derived: Derived) -> Fluid:
         equation_of_state=Tait(scene.blood.density, derived.sound_speed),
         rheology=make_rheology(scene.blood.rheology),
         calibration=plan.calibration,
+        spacing=plan.spacing,
         artificial_viscosity=scene.blood.artificial_viscosity,
         courant_number=scene.discretization.courant_number,
         nested=scene.discretization.viscous_form == "nested",

@@ -60,8 +60,9 @@ def kick_drift(
 ) -> ti.math.vec2:
     """Advance velocity and position by dt [s], then keep blood inside the wall.
 
-    v' = v + a dt (Eq. 17), x' = x + v' dt: symplectic Euler.  `as_printed` takes Eq. 18 as printed,
-    x' = x + (v + v')/2 dt, which amplifies sound at every step (determinant 1 + (w dt)^2/2).
+    v' = v + a dt (Eq. 17), x' = x + (v' + w) dt: symplectic Euler, with the shifting w.
+    `as_printed` takes Eq. 18 as printed, x' = x + (v + v')/2 dt, which amplifies sound of angular
+    frequency f at every step (determinant 1 + (f dt)^2/2).
 
     Wall penetration correction: blood that comes nearer to the lumen surface than WALL_MARGIN
     setbacks is put back on that distance along the normal of the proxies beside it, and its
@@ -72,7 +73,7 @@ def kick_drift(
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.
-    Reads: acceleration, wall, lists.  Writes: velocity, position.
+    Reads: acceleration, shifting, wall, lists.  Writes: velocity, position.
     """
     moved2 = 0.0
     corrected = 0.0
@@ -84,7 +85,7 @@ def kick_drift(
         if ti.static(as_printed):
             x += 0.5 * (v + v_new) * dt
         else:
-            x += v_new * dt
+            x += (v_new + p.shifting[i]) * dt
         walls = nb.wall_count[i]
         if ti.static(has_buffers(inflow)):
             buffer = inflow.regions.buffer_at(x_old)

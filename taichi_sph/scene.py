@@ -143,8 +143,8 @@ class Blood(_Table):
     """Rest density rho_0 [kg/m^3] (svMultiPhysics test cases; 1050-1060)."""
     rheology: Union[NewtonianTable, CassonTable] = CassonTable()
     """Viscosity law."""
-    artificial_viscosity: NonNegative = 0.05
-    """Monaghan's alpha [-]: damps sound between approaching particles."""
+    artificial_viscosity: NonNegative = 0.0
+    """Monaghan's alpha [-]: blood is then more viscous than its law says, for study only."""
 
 
 class Discretization(_Table):

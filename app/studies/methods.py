@@ -191,9 +191,10 @@ class Ballistic:
 
 @ti.kernel
 def fall(p: ti.template(), gravity: ti.math.vec3, rest_density: float):
-    """Writes: acceleration, density."""
+    """Writes: acceleration, density, shifting."""
     for i in range(p.count[None]):
         p.acceleration[i] = gravity
+        p.shifting[i] = ti.Vector([0.0, 0.0, 0.0])
         p.density[i] = rest_density
 
 

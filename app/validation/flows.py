@@ -68,6 +68,8 @@ class Liquid:
     """Monaghan's alpha [-]."""
     nested: bool = False
     courant_number: float = 0.4
+    sound_damping: float = Fluid.sound_damping
+    shifting: float = Fluid.shifting
 
     @classmethod
     def of_scene(cls, scene: Scene, sound_speed: float) -> "Liquid":
@@ -96,9 +98,12 @@ class Liquid:
             equation_of_state=Tait(DENSITY, self.sound_speed, self.background_pressure),
             rheology=self.rheology,
             calibration=calibrate(self.kernel, self.spacing, self.wall_spacing, DENSITY),
+            spacing=self.spacing,
             artificial_viscosity=self.artificial_viscosity,
             nested=self.nested,
             courant_number=self.courant_number,
+            sound_damping=self.sound_damping,
+            shifting=self.shifting,
         )
 
 
@@ -188,11 +193,16 @@ def box(
     if jitter:
         noise = np.random.default_rng(seed).normal(size=x.shape)
         x = (x + jitter * liquid.spacing * noise) % size
-    simulation = make_simulation(liquid, x, velocity(x), NO_WALL, NO_WALL, (0.0 * size, size), size)
+    simulation = periodic(liquid, x, size)
     if jitter:
         settle(simulation)
-        set_velocity(simulation, velocity)
+    set_velocity(simulation, velocity)
     return simulation
+
+
+def periodic(liquid: Liquid, position: np.ndarray, size: np.ndarray) -> Simulation:
+    """Blood at rest at positions [m], (n, 3), in a periodic box of a size [m], (3,)."""
+    return make_simulation(liquid, position, None, NO_WALL, NO_WALL, (0.0 * size, size), size)
 
 
 def rings(radius: float, spacing: float, length: float) -> np.ndarray:

@@ -39,6 +39,13 @@ CASES = (
     Case("shear_wave", "shear wave", "f32", viscosity.shear_wave),
     Case("viscosity", "viscosity delivered in scenes", "f32", delivered.delivered_viscosity, 16),
     Case("taylor_green", "Taylor-Green vortices", "f32", viscosity.taylor_green),
+    Case(
+        "taylor_green_3d",
+        "Taylor-Green vortices in three dimensions",
+        "f32",
+        viscosity.taylor_green_3d,
+        30,
+    ),
     Case("hydrostatic", "hydrostatic column", "f32", statics.hydrostatic),
     Case("poiseuille", "Poiseuille flow in a tube", "f32", pipes.poiseuille),
     Case("womersley", "Womersley flow in a tube", "f32", pipes.womersley),

@@ -34,11 +34,18 @@ class Calibration:
     """gamma of Eq. 3 in the wall's viscous force: simple shear, at rest on the lumen surface."""
     wall_gradient: float
     """gamma of Eq. 3 in the velocity gradient."""
+    wall_concentration: float
+    """gamma of Eq. 3 in the gradient of the concentration, which is 0 in the first layer."""
 
 
 def softening(kernel: WendlandC2) -> float:
     """0.01 h_s^2 [m^2], which keeps v.r/r^2 finite (Monaghan 1992; Eq. 16's epsilon h^2)."""
     return 0.01 * kernel.smoothing_length**2
+
+
+CROWDING = 0.2
+"""Weight of close pairs in the gradient of the concentration (Monaghan 2000, as Sun et al. 2017,
+doi:10.1016/j.cma.2016.10.028)."""
 
 
 def _lattice(radius: float, spacing: float) -> np.ndarray:
@@ -116,6 +123,13 @@ def calibrate(
     missing_density = volume * kernel.w_of(np.linalg.norm(missing, axis=1)).sum()
     missing_force = -2.0 * volume * (slope(missing) * missing[:, 2]).sum()
 
+    crowding = (
+        1.0
+        + CROWDING
+        * (kernel.w_of(np.linalg.norm(missing, axis=1)) / float(kernel.w_of(np.asarray(d)))) ** 4
+    )
+    missing_concentration = -(volume * crowding * slope(missing) * missing[:, 2]).sum()
+
     wall_sums = partial(_wall_sums, kernel, d, wall_spacing)
 
     def excess_force(depth: float) -> float:
@@ -124,7 +138,7 @@ def calibrate(
         return -force / w - missing_force / missing_density
 
     depth = brentq(excess_force, 0.5 * d, 0.97 * kernel.support_radius, xtol=1e-9 * d)
-    w, _, friction, shear = wall_sums(depth)
+    w, force, friction, shear = wall_sums(depth)
     # Simple shear u = g z, no slip at z = 0: no net viscous force on the first layer, u = g d/2.
     # Blood: viscosity * sum 2 V slope r^2/(r^2+eps) (u_i - u_j); wall: 2 V slope r^2/(r^2+eps) u.
     squared = (present**2).sum(axis=1)
@@ -143,4 +157,5 @@ def calibrate(
         wall_density=float(missing_density / w),
         wall_friction=float(wall_friction),
         wall_gradient=float(wall_gradient),
+        wall_concentration=float(-missing_concentration / force),
     )

@@ -33,6 +33,7 @@ import taichi as ti
 from taichi_sph.fluid.density import density_rate, density_sums, pair_gradient
 from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import shear_rate
+from taichi_sph.fluid.shifting import shifting_velocity
 from taichi_sph.fluid.wcsph import sum_acceleration
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
@@ -175,21 +176,23 @@ def estimate_pressure(
 ):
     """Density, q^0, viscosity and T^2 rho_0 D of each particle (module's first equation).
 
-    Reads: position, velocity.  Writes: density, pressure_term, viscosity, diagonal.
+    Reads: position, velocity.  Writes: density, shifting, pressure_term, viscosity, diagonal.
     """
     rest_density = ti.static(fluid.rest_density)
     radius = ti.static(fluid.kernel.support_radius)
     thickest = ti.static(LARGEST_VISCOSITY) * rest_density * radius * radius / interval
     least = ti.static(SMALLEST_DIAGONAL / fluid.kernel.support_radius**2)
     for i in range(p.count[None]):
-        ratio, rate, response, gradient = density_sums(
-            i, p, w, nb, fluid, fluid.rest_density, fluid.rheology.shear_dependent, True
+        ratio, rate, response, gradient, concentration = density_sums(
+            i, p, w, nb, fluid, fluid.rest_density
         )
+        sheared = shear_rate(gradient)
+        p.shifting[i] = shifting_velocity(fluid, ratio, sheared, concentration, 1.0 / interval)
         diagonal[i] = interval * interval * rest_density * ti.max(least, response)
         p.density[i] = ratio * rest_density
         excess = ti.static(STIFFNESS) * (ratio - 1.0) + ti.static(DAMPING) * interval * rate
         pressure_term[i] = ti.max(0.0, excess) / diagonal[i]
-        viscosity[i] = ti.min(thickest, fluid.rheology.viscosity(shear_rate(gradient)))
+        viscosity[i] = ti.min(thickest, fluid.rheology.viscosity(sheared))
 
 
 @ti.kernel

@@ -41,7 +41,8 @@ class AccelerationModel(Protocol):
         """Replace ``particles.acceleration`` [m/s^2]; change nothing else but own scratch.
 
         The old values may be read: they are the previous step's accelerations.
-        ``particles.density`` must be written too: diagnostics read it.
+        ``particles.density`` and ``particles.shifting`` must be written too: diagnostics read the
+        one, the integrator the other.
         """
         ...
 
@@ -59,12 +60,18 @@ class Fluid:
     equation_of_state: Tait
     rheology: Rheology
     calibration: Calibration
-    artificial_viscosity: float
+    spacing: float
+    """d [m]."""
+    artificial_viscosity: float = 0.0
     """Monaghan's alpha [-]."""
     nested: bool = False
     """Viscous stress in the paper's nested form (Eqs. 10 and 12)."""
     courant_number: float = 0.4
     """Step over h_s/(c + v) [-]."""
+    sound_damping: float = 1.0
+    """Factor zeta of the damping of sound, see `taichi_sph.fluid.wcsph` [-]."""
+    shifting: float = 20.0
+    """Factor s of the shifting, see `taichi_sph.fluid.shifting` [-]."""
 
     @property
     def rest_density(self) -> float:
@@ -90,6 +97,16 @@ class Fluid:
     def artificial_viscosity_factor(self) -> float:
         """Factor alpha h_s c of the artificial viscosity [m^2/s]."""
         return self.artificial_viscosity * self.kernel.smoothing_length * self.sound_speed
+
+    @property
+    def sound_damping_factor(self) -> float:
+        """Factor zeta h_s c of the damping of sound [m^2/s]."""
+        return self.sound_damping * self.kernel.smoothing_length * self.sound_speed
+
+    @property
+    def sound_frequency(self) -> float:
+        """Fewest steps that sound asks for, c/(C h_s) [1/s]."""
+        return self.sound_speed / (self.courant_number * self.kernel.smoothing_length)
 
     def step_limits(self, speed: float, acceleration: float) -> "StepLimits":
         """Limits of an explicit step at a largest speed [m/s] and acceleration [m/s^2]."""

@@ -2,9 +2,15 @@
 
     a_i = a_i^pressure + a_i^viscous + sum_k a_ik^wall + g      [m/s^2]     (Eq. 5, per mass)
 
-The first pass sums density (with the shear rate, where blood is not Newtonian), the second the
-accelerations.  Everything is per unit mass; the paper mixes forces, force densities and
-accelerations.
+The first pass sums density with what changes it, the second the accelerations.  Everything is per
+unit mass; the paper mixes forces, force densities and accelerations.
+
+Sound is damped by a pressure that answers to the rate at which density rises, a bulk viscosity
+
+    q_i = max(0, p_i/rho_i^2 + zeta c h_s (d(rho/rho_0)/dt)_i/rho_i)
+
+(as the acoustic damper of Sun et al. 2023, doi:10.1016/j.jcp.2023.112056): shear, which changes no
+density, does not feel it, as it would Monaghan's artificial viscosity.
 """
 
 import taichi as ti
@@ -20,6 +26,7 @@ from taichi_sph.fluid.forces import (
 )
 from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import shear_rate
+from taichi_sph.fluid.shifting import shifting_velocity
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.wall import Wall, wall_velocity
@@ -74,25 +81,30 @@ def sum_density(
     pressure_term: ti.template(),
     viscosity: ti.template(),
 ):
-    """Density (Eq. 2), p_i/rho_i^2 (Eq. 14) and the viscosity of the shear rate (Eq. 8).
+    """Density (Eq. 2), q_i (Eq. 14), the viscosity of the shear rate (Eq. 8) and the shifting.
 
     | symbol | code | meaning | unit |
     |---|---|---|---|
     | rho_i | rho | density, the particle itself included | kg/m^3 |
     | L_i | gradient | velocity gradient, see `taichi_sph.fluid.density` | 1/s |
-    | p_i/rho_i^2 | pressure_term | of the equation of state | m^5/(kg s^2) |
+    | q_i | pressure_term | of the equation of state and the damping of sound | m^5/(kg s^2) |
     | mu_i | viscosity | of the shear rate sqrt(2 D:D) | Pa s |
 
     The nested form has its own viscosity, see `sum_stress`.
-    Reads: position, velocity.  Writes: density, pressure_term, viscosity.
+    Reads: position, velocity.  Writes: density, shifting, pressure_term, viscosity.
     """
     for i in range(p.count[None]):
-        rho, _, _, gradient = density_sums(
-            i, p, w, nb, fluid, 1.0, fluid.rheology.shear_dependent and not fluid.nested, False
-        )
+        rho, density_rises, _, gradient, concentration = density_sums(i, p, w, nb, fluid, 1.0)
+        rate = shear_rate(gradient)
         p.density[i] = rho
-        pressure_term[i] = fluid.equation_of_state.pressure(rho) / (rho * rho)
-        viscosity[i] = fluid.rheology.viscosity(shear_rate(gradient))
+        damping = ti.static(fluid.sound_damping_factor) * density_rises
+        pressure = fluid.equation_of_state.pressure(rho) / rho + damping
+        pressure_term[i] = ti.max(0.0, pressure) / rho
+        viscosity[i] = fluid.rheology.viscosity(rate)
+        ratio = rho * ti.static(1.0 / fluid.rest_density)
+        p.shifting[i] = shifting_velocity(
+            fluid, ratio, rate, concentration, ti.static(fluid.sound_frequency)
+        )
 
 
 @ti.kernel

@@ -51,6 +51,9 @@ class Particles:
     """a [m/s^2], shape (capacity,); state, for a model may read the previous step's."""
     density: ti.Field
     """rho [kg/m^3], shape (capacity,)."""
+    shifting: ti.MatrixField
+    """Velocity beside the flow at which the next step moves a particle [m/s], shape (capacity,);
+    no state: every model writes it."""
     identity: ti.Field
     """Number of the particle, the same for its whole life, shape (capacity,)."""
 
@@ -71,6 +74,7 @@ class Particles:
         """One for each quantity, in their order."""
         for quantity, field in zip(self.quantities, self.fields, strict=True):
             setattr(self, quantity.name, field)
+        self.shifting = ti.Vector.field(3, float, capacity)
         # A sort copies all rows but positions, which the lists hold, through these.
         moved = [k for k, q in enumerate(self.quantities) if q.name != "position"]
         self.sorted_fields = tuple(self.fields[k] for k in moved)

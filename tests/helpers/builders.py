@@ -70,6 +70,7 @@ def make_fluid(
     rheology: Any = None,
     alpha: float = 0.0,
     nested: bool = False,
+    damping: float = 0.0,
 ) -> Fluid:
     """A fluid of the stages; without a rheology its viscosity is zero."""
     return Fluid(
@@ -77,8 +78,10 @@ def make_fluid(
         Tait(DENSITY, sound_speed, background),
         rheology or Newtonian(0.0),
         calibration(),
-        alpha,
-        nested,
+        spacing=D,
+        artificial_viscosity=alpha,
+        nested=nested,
+        sound_damping=damping,
     )
 
 
@@ -105,6 +108,7 @@ class Prescribed:
         acceleration[:live] = self.law(particles.position.to_numpy()[:live].astype(float))
         particles.acceleration.from_numpy(acceleration)
         particles.density.fill(DENSITY)
+        particles.shifting.fill(0.0)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """The step that the test chose [s]."""
@@ -188,6 +192,7 @@ class Setup:
             sound_speed=fluid.equation_of_state.sound_speed,
             background=fluid.equation_of_state.background_pressure,
             alpha=fluid.artificial_viscosity,
+            damping=fluid.sound_damping,
             eta=rheology.eta,
             tau_y=getattr(rheology, "tau_y", 0.0),
             n=getattr(rheology, "n", 0.0),

@@ -75,12 +75,13 @@ class Blood:
     sound_speed: float
     background: float
     alpha: float
+    damping: float
     eta: float
     tau_y: float
     n: float
     """Casson's constants; tau_y = 0 is Newtonian."""
     factors: dict[str, float]
-    """Calibration: mass, viscosity, gradient, wall_density, wall_friction, wall_gradient."""
+    """Calibration: mass, viscosity, gradient and those of the wall."""
     period: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
@@ -154,9 +155,39 @@ class Blood:
         """Rest volume m/rho_0 [m^3]."""
         return self.mass / self.rest_density
 
+    def density_rate(self) -> np.ndarray:
+        """Rate of the density of Eq. 2 over rho_0, the wall at rest [1/s]."""
+        blood = self.spacing_volume * np.einsum("ija,ija->i", self.v_ij, self.grad)
+        wall = np.einsum("ia,ika,k->i", self.v, self.grad_wall, self.volume)
+        return blood + self.factors["wall_density"] * wall
+
+    def pressure_term(self) -> np.ndarray:
+        """p/rho^2 and the damping of sound, zeta c h_s (d(rho/rho_0)/dt)/rho, not below zero."""
+        damping = self.damping * self.sound_speed * (self.support / 2.0) * self.density_rate()
+        return np.maximum(0.0, self.p / self.rho**2 + damping / self.rho)
+
+    def concentration_gradient(self) -> np.ndarray:
+        """Sum of V f grad W with f = 1 + 0.2 (W/W(d))^4, and of the wall's with its gamma [1/m]."""
+        w = wendland(np.linalg.norm(self.r, axis=-1), self.support)
+        f = 1.0 + 0.2 * (w / wendland(np.array(self.spacing), self.support)) ** 4
+        blood = self.spacing_volume * np.einsum("ij,ija->ia", f, self.grad)
+        wall = np.einsum("k,ika->ia", self.volume, self.grad_wall)
+        return self.factors["gradient"] * (blood + self.factors["wall_concentration"] * wall)
+
+    def shifting(self, factor: float, frequency: float) -> np.ndarray:
+        """Velocity beside the flow [m/s], in so many steps a time [1/s]."""
+        h = self.support / 2.0
+        weights = np.full_like(self.rho, self.spacing_volume)
+        rate = shear_rate(self.velocity_gradient(weights))
+        w = -np.minimum(factor * rate, 0.2 * frequency)[:, None] * h**2
+        w = w * self.concentration_gradient()
+        size = np.linalg.norm(w, axis=1)
+        surrounded = np.clip((self.rho / self.rest_density - 0.93) / 0.05, 0.0, 1.0)
+        return (surrounded * np.minimum(1.0, rate * h / np.maximum(size, 1e-30)))[:, None] * w
+
     def pressure_acceleration(self) -> np.ndarray:
         """Eq. 13, with the calibration of the gradient [m/s^2]."""
-        q = self.factors["gradient"] * self.p / self.rho**2
+        q = self.factors["gradient"] * self.pressure_term()
         return -self.mass * np.einsum("ij,ija->ia", q[:, None] + q[None, :], self.grad)
 
     def artificial_acceleration(self) -> np.ndarray:
@@ -198,7 +229,7 @@ class Blood:
             * self.rest_density
             * self.volume
         )
-        return -(self.p / self.rho**2)[:, None] * np.einsum("k,ika->ia", psi, self.grad_wall)
+        return -self.pressure_term()[:, None] * np.einsum("k,ika->ia", psi, self.grad_wall)
 
     def wall_artificial_acceleration(self) -> np.ndarray:
         """The artificial term of Eq. 15: rho_k = rho_i, v_k = 0, approaching pairs only."""

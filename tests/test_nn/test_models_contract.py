@@ -1,5 +1,6 @@
 """What every acceleration model must hold, whatever it computes: physics, network or stand-in."""
 
+import math
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
@@ -25,8 +26,8 @@ FRAME = {"f64": 1e-9, "f32": 5e-3}
 TRAIN = np.array((0.4, -0.3, 0.2))
 """Velocity of a moving frame [m/s]: below what a network refuses as too fast."""
 GRAVITY = (1.0, -2.0, -9.81)
-FLUID = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), alpha=0.05)
-NESTED = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), alpha=0.05, nested=True)
+FLUID = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), damping=1.0)
+NESTED = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), nested=True, damping=1.0)
 BINNED = ("alpha_dis_b", "alpha_rv_b", "beta_dis_b", "beta_rv_b", "alpha_dis_p", "beta_dis_p")
 """Features that jump where a value changes its bin; rounding may do that."""
 
@@ -46,7 +47,7 @@ def network(head: str) -> Weights:
     training = Training(
         head=head, inputs=inputs, spacing=D, support_radius=R,
         frame_interval=SCALES.frame_interval, substeps=4, rounds=0,
-        sound_speed=SCALES.sound_speed, wall_spacing_ratio=1.0, artificial_viscosity=0.05,
+        sound_speed=SCALES.sound_speed, wall_spacing_ratio=1.0, artificial_viscosity=0.0,
         viscosity_ratio=17.3, correction="bp", seed=0, scene="tube", scene_hash="0" * 64,
     )  # fmt: skip
     one = np.ones(len(inputs), np.float32)
@@ -77,6 +78,7 @@ def put(stage: Setup, x: np.ndarray, v: np.ndarray, names: np.ndarray | None = N
     previous[: len(x)] = 1e3 * np.roll(x, 1, axis=1)
     stage.particles.acceleration.from_numpy(previous)
     stage.particles.density.fill(-1.0)
+    stage.particles.shifting.fill(math.nan)
     stage.build()
 
 
@@ -113,6 +115,7 @@ def test_a_model_writes_finite_accelerations_and_densities_and_nothing_else(mode
     assert np.isfinite(a).all() and np.abs(a).max() > 0.0
     density = stage.in_order(p.density)
     assert np.isfinite(density).all() and density.min() > 0.0
+    assert np.isfinite(stage.in_order(p.shifting)).all()
     for field, values in zip(fields, before, strict=True):
         np.testing.assert_array_equal(field.to_numpy(), values)
 

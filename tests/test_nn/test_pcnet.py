@@ -47,7 +47,7 @@ def weights(head: str, seed: int = 0) -> Weights:
         rounds=0,
         sound_speed=SCALES.sound_speed,
         wall_spacing_ratio=1.0,
-        artificial_viscosity=0.05,
+        artificial_viscosity=0.0,
         viscosity_ratio=17.3,
         correction="bp",
         seed=0,
@@ -234,7 +234,7 @@ def test_shipped_weights_refuse_another_liquid(tmp_path):
     scene = folder / "scene.toml"
     text = scene.read_text()
     for old, new, field in (
-        ("[blood]", "[blood]\nartificial_viscosity = 0.2", "artificial_viscosity is 0.05 in the"),
+        ("[blood]", "[blood]\nartificial_viscosity = 0.2", "artificial_viscosity is 0 in the"),
         ("[discretization]", "[discretization]\nsupport_ratio = 3.0", "support_ratio is 2 in the"),
     ):
         assert old in text

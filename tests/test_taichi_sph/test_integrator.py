@@ -49,6 +49,7 @@ def one_step_map(printed: bool, w: float) -> np.ndarray:
     acceleration = np.zeros((CAPACITY, 3), float_dtype())
     acceleration[:2] = spring(stage.particles.position.to_numpy()[:2].astype(float))
     stage.particles.acceleration.from_numpy(acceleration)
+    stage.particles.shifting.fill(0.0)
     kick_drift(stage.particles, stage.wall, stage.neighbors, None, printed, dt)
     after_x = (stage.in_order(stage.particles.position) - MIDDLE) / small
     after_v = stage.in_order(stage.particles.velocity) / (OMEGA * small)
