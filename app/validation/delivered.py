@@ -7,7 +7,8 @@ periodic box whose particles have been put out of order and have settled.
 The pressure is the scene's too, for particles resist shear with a part of it: PRESSURE, and what
 all open openings are held at.  A box has a volume, not a pressure, and sheared particles need
 another volume than resting ones: a first wave tells what density they take in the box, and the box
-of the second has the volume that gives them the pressure.
+of the second has the volume that gives them the pressure.  The noise that a wave then makes can
+raise it again: a closed box cannot give way.
 """
 
 import math

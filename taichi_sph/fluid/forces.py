@@ -20,6 +20,7 @@ Taichi is started.
 
 import taichi as ti
 
+from taichi_sph.fluid.shifting import surrounded
 from taichi_sph.particles.wall import wall_velocity
 
 
@@ -33,14 +34,26 @@ def pair_pressure(fluid: ti.template(), pressure_term_i, pressure_term_j):
 
 
 @ti.func
-def pair_artificial_viscosity(fluid: ti.template(), r_ij, v_ij, softened, density_sum):
+def artificial_factor(fluid: ti.template(), density):
+    """Factor alpha h_s c of the artificial viscosity where blood has a density [m^2/s].
+
+    Thin blood, as `taichi_sph.fluid.shifting` has it, has its own alpha beside the scene's: nothing
+    else keeps its particles from clumping, for they have no pressure.
+    """
+    scale = ti.static(fluid.kernel.smoothing_length * fluid.sound_speed)
+    ratio = density * ti.static(1.0 / fluid.rest_density)
+    thin = ti.static(fluid.thin_viscosity) * (1.0 - surrounded(ratio))
+    return scale * (ti.static(fluid.artificial_viscosity) + thin)
+
+
+@ti.func
+def pair_artificial_viscosity(alpha, r_ij, v_ij, softened, density_sum):
     """Artificial viscosity Pi_ij, to be multiplied by -m grad W_ij (Monaghan 1992, eq. 4.1).
 
     Pi_ij = -2 alpha h_s c (v_ij.r_ij)/(r^2 + eps)/(rho_i + rho_j) for particles that approach each
-    other, else 0.  Unit: m^5/(kg s^2).
+    other, else 0; `alpha` is alpha h_s c.  Unit: m^5/(kg s^2).
     """
-    factor = ti.static(-2.0 * fluid.artificial_viscosity_factor)
-    return factor * (ti.min(0.0, v_ij.dot(r_ij)) / softened) / density_sum
+    return -2.0 * alpha * (ti.min(0.0, v_ij.dot(r_ij)) / softened) / density_sum
 
 
 @ti.func
@@ -88,9 +101,10 @@ def wall_pair_acceleration(w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, flu
     slope = fluid.kernel.slope(ti.sqrt(r2))
     v_ik = v_i - wall_velocity(w, k)
     pressure = pair_pressure(fluid, p_i, 0.0)
-    if ti.static(fluid.artificial_viscosity > 0.0):
+    if ti.static(fluid.has_artificial_viscosity):
         # One quotient for two: rho_i + rho_k = 2 rho_i.
-        pressure += pair_artificial_viscosity(fluid, r_ik, v_ik, softened * rho_i, 2.0)
+        alpha = artificial_factor(fluid, rho_i)
+        pressure += pair_artificial_viscosity(alpha, r_ik, v_ik, softened * rho_i, 2.0)
     # The quotient by rho_i rho_k does not depend on k and leaves the loop.
     friction = ti.static(2.0 * fluid.calibration.wall_friction) * mu_i / (rho_i * rho_i)
     a_ik = -(ti.static(fluid.calibration.wall_density) * w.volume[k] * pressure * slope) * r_ik

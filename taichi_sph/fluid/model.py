@@ -70,6 +70,8 @@ class Fluid:
     """Step over h_s/(c + v) [-]."""
     sound_damping: float = 1.0
     """Factor zeta of the damping of sound, see `taichi_sph.fluid.wcsph` [-]."""
+    thin_viscosity: float = 0.05
+    """Monaghan's alpha where blood is thin, see `taichi_sph.fluid.forces` [-]."""
     shifting: float = 20.0
     """Factor s of the shifting, see `taichi_sph.fluid.shifting` [-]."""
 
@@ -94,9 +96,9 @@ class Fluid:
         return softening(self.kernel)
 
     @property
-    def artificial_viscosity_factor(self) -> float:
-        """Factor alpha h_s c of the artificial viscosity [m^2/s]."""
-        return self.artificial_viscosity * self.kernel.smoothing_length * self.sound_speed
+    def has_artificial_viscosity(self) -> bool:
+        """Whether any blood has it."""
+        return self.artificial_viscosity > 0.0 or self.thin_viscosity > 0.0
 
     @property
     def sound_damping_factor(self) -> float:

@@ -34,14 +34,20 @@ surface of a lattice the first layer has 0.88, the second 1.00."""
 
 
 @ti.func
+def surrounded(density_ratio):
+    """Factor f_i from rho/rho_0: 0 at a free surface, 1 inside."""
+    inside = (density_ratio - SURFACE) / ti.static(SURROUNDED - SURFACE)
+    return ti.max(0.0, ti.min(1.0, inside))
+
+
+@ti.func
 def shifting_velocity(fluid: ti.template(), density_ratio, rate, concentration, frequency):
     """Velocity w_i of a particle beside the flow [m/s].
 
     Of rho/rho_0, the shear rate |D| [1/s], C [1/m] and how many steps there are in a time [1/s].
     """
     h = ti.static(fluid.kernel.smoothing_length)
-    surrounded = (density_ratio - SURFACE) / ti.static(SURROUNDED - SURFACE)
     quick = ti.min(ti.static(fluid.shifting) * rate, LARGEST_SHIFTING * frequency)
     w = -quick * h * h * concentration
     most = rate * h
-    return ti.max(0.0, ti.min(1.0, surrounded)) * most / ti.max(most, w.norm() + 1e-30) * w
+    return surrounded(density_ratio) * most / ti.max(most, w.norm() + 1e-30) * w

@@ -17,6 +17,7 @@ import taichi as ti
 
 from taichi_sph.fluid.density import density_sums
 from taichi_sph.fluid.forces import (
+    artificial_factor,
     mean_viscosity,
     pair_artificial_viscosity,
     pair_nested_stress,
@@ -196,8 +197,9 @@ def sum_acceleration(
             v_ij = v_i - p.velocity[j]
             rho_j = p.density[j]
             pressure = pair_pressure(fluid, p_i, pressure_term[j])
-            if ti.static(fluid.artificial_viscosity > 0.0):
-                pressure += pair_artificial_viscosity(fluid, r_ij, v_ij, softened, rho_i + rho_j)
+            if ti.static(fluid.has_artificial_viscosity):
+                alpha = artificial_factor(fluid, 0.5 * (rho_i + rho_j))
+                pressure += pair_artificial_viscosity(alpha, r_ij, v_ij, softened, rho_i + rho_j)
             a_i -= (pressure * slope) * r_ij
             if ti.static(fluid.nested):
                 a_i += pair_nested_stress(fluid, stress[i] + stress[j], r_ij, slope, rho_i, rho_j)

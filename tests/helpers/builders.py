@@ -82,6 +82,7 @@ def make_fluid(
         artificial_viscosity=alpha,
         nested=nested,
         sound_damping=damping,
+        thin_viscosity=0.0,
     )
 
 
