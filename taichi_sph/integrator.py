@@ -69,7 +69,8 @@ def kick_drift(
     velocity into the wall is taken away.  The pressure of the wall holds blood that is packed;
     this holds a lone droplet, which has no pressure.
 
-    Blood in a buffer of `inflow` (the `BufferZones`, or None) moves with it, and no wall stops it.
+    Blood in a buffer of `inflow` (the `BufferZones`, or None) moves with it, and no wall stops it;
+    none is shifted within a support radius of a buffer.
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.
@@ -80,12 +81,17 @@ def kick_drift(
     for i in range(p.count[None]):
         v = p.velocity[i]
         v_new = v + p.acceleration[i] * dt
+        shifting = p.shifting[i]
+        if ti.static(has_buffers(inflow)):
+            # The rows of a buffer end at its rim: blood would be shifted back into the gap.
+            beside = inflow.regions.buffer_at(p.position[i], nb.support_radius) >= 0
+            shifting *= ti.select(beside, 0.0, 1.0)
         x = p.position[i]
         x_old = x
         if ti.static(as_printed):
             x += 0.5 * (v + v_new) * dt
         else:
-            x += (v_new + p.shifting[i]) * dt
+            x += (v_new + shifting) * dt
         walls = nb.wall_count[i]
         if ti.static(has_buffers(inflow)):
             buffer = inflow.regions.buffer_at(x_old)

@@ -78,14 +78,14 @@ class BufferRegions:
         return len(self.centre)
 
     @ti.func
-    def buffer_at(self, x):
-        """Number of the buffer that a position belongs to; -1 if to none."""
+    def buffer_at(self, x, before: ti.template() = 0.0):
+        """Number of the buffer that a position is in, or so far before [m]; -1 if in none."""
         buffer = -1
         for k in ti.static(range(self.count)):
             r = x - ti.Vector(self.centre[k])
             along = r.dot(ti.Vector(self.normal[k]))
             aside2 = r.norm_sqr() - along * along
-            if along > 0.0 and along < self.depth and aside2 < ti.static(self.radius[k] ** 2):
+            if along > -before and along < self.depth and aside2 < ti.static(self.radius[k] ** 2):
                 buffer = k
         return buffer
 

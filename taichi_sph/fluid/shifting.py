@@ -8,7 +8,8 @@ Any pressure then pushes them unevenly: like grains they resist shear with a par
 which in blood is far more than viscosity (docs/physics.md).  Shifting keeps them even (Lind et al.
 2012, doi:10.1016/j.jcp.2011.10.027; Sun et al. 2017, doi:10.1016/j.cma.2016.10.028).  It moves
 positions only: momentum is not touched.  Blood at rest is not shifted, for the rate is that of the
-local shear, and nothing where neighbours are missing: at a free surface C_i points out of it.
+local shear, and nothing where neighbours are missing: at a free surface C_i points out of it.  The
+integrator leaves it out beside buffers, whose blood does not fill them to the rim.
 
 | symbol | here | meaning | unit |
 |---|---|---|---|

@@ -41,9 +41,7 @@ def test_what_comes_in_is_marked_from_now_on_and_as_much_as_comes_in(driven):
     tracer_of(driven).mark_inflow("top")
     driven.advance_to(0.12)
     dye, rows = dye_of(driven), driven.particles.rows()
-    # At the rim a few are pushed back into the buffer; they then come in again.
-    again = sum(dye[i] > 0.0 for i in inside & dye.keys())
-    assert again < 0.01 * len(inside), "what was in the vessel is as it was"
+    assert not any(dye[i] for i in inside & dye.keys()), "what was in the vessel is as it was"
     there = rows["identity"][np.abs(rows["position"][:, 2]) < 0.5 * LENGTH]
     crossed = set(there.tolist()) - inside
     assert all(dye[i] == 1.0 for i in crossed)
@@ -114,7 +112,8 @@ def test_blood_is_as_old_as_it_has_been_in_the_vessel(driven):
 
 
 def test_the_mean_age_of_what_leaves_a_steady_flow_is_its_volume_over_the_flow(driven):
-    # Danckwerts 1953.  The tube is emptied once and a half before, and twice meanwhile.
+    # Danckwerts 1953.  The tube is emptied three times before, and twice meanwhile: the first blood
+    # that comes in is 2 % older, for the flow is not steady yet.
     places = len(driven.vessel.openings) + 2
     bottom = 2 + [o.name for o in driven.vessel.openings].index("bottom")
 
@@ -126,10 +125,10 @@ def test_the_mean_age_of_what_leaves_a_steady_flow_is_its_volume_over_the_flow(d
         assert driven.diagnostics().mean_age["bottom"] == mean[bottom]
         return float(mean[bottom] * count[bottom]), int(count[bottom])
 
-    driven.advance_to(0.1)
+    driven.advance_to(0.18)
     sum_before, count_before = left()
     volumes = []
-    for time in np.linspace(0.11, 0.22, 12):
+    for time in np.linspace(0.19, 0.3, 12):
         driven.advance_to(time)
         z = driven.positions()[:, 2]
         volumes.append((np.abs(z) < 0.5 * LENGTH).sum() * OF_ONE)
