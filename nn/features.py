@@ -37,13 +37,11 @@ from dataclasses import dataclass
 import taichi as ti
 
 from taichi_sph.fluid.density import (
-    concentration_gradient,
+    calibrated_gradient,
     density_of,
     density_rate,
     density_response,
     pair_crowding,
-    pair_gradient,
-    velocity_gradient_of,
 )
 from taichi_sph.fluid.rheology import shear_rate
 from taichi_sph.fluid.shifting import shifting_velocity
@@ -211,11 +209,11 @@ def blood_features(
             r = q * ti.static(scales.support_radius)
             w_ij = fluid.kernel.w(r)
             blood += w_ij
-            _, gradient_ji, square_ij = pair_gradient(fluid.kernel.slope(r), q * q, r_ji, v_ji)
+            gradient_ji = fluid.kernel.slope(r) * r_ji
             velocity_gradient -= v_ji.outer_product(gradient_ji)
             concentration += pair_crowding(fluid, w_ij) * gradient_ji
             gradient += gradient_ji
-            square += square_ij
+            square += gradient_ji.norm_sqr()
             if ti.static(inputs.among(POSITION, POSITION + 1, POSITION + 2)):
                 r_sum += r_ji
             if ti.static(inputs.among(VELOCITY, VELOCITY + 1, VELOCITY + 2)):
@@ -330,8 +328,12 @@ def features_of(
     blood_rates *= ti.static(scales.speed)
     rate = -density_rate(fluid, blood_rates.trace(), wall_rates.trace())
     f[DIVERGENCE] = -rate * ti.static(scales.support_radius * scales.frame_interval)
-    sheared = radius * shear_rate(velocity_gradient_of(fluid, blood_rates, wall_rates))
-    concentration = -radius * concentration_gradient(fluid, crowding, wall_gradient)
+    sheared = radius * shear_rate(
+        calibrated_gradient(fluid, fluid.calibration.wall_gradient, blood_rates, wall_rates)
+    )
+    concentration = -radius * calibrated_gradient(
+        fluid, fluid.calibration.wall_concentration, crowding, wall_gradient
+    )
     steps = ti.static(1.0 / scales.frame_interval)
     shifting = shifting_velocity(fluid, f[DENSITY_RATIO], sheared, concentration, steps)
     response = density_response(fluid, blood_gradient, wall_gradient, square)

@@ -41,6 +41,13 @@ BACKGROUND = 2.0
 """Background pressure of flows without a free surface [rho U^2]: the least that keeps the pressure
 above zero everywhere.  Particles under pressure resist shear like grains, so it must be small."""
 
+DISORDER = 0.5
+"""Random displacement of disordered blood before it settles [spacings]: after a tenth particles
+find their lattice again."""
+
+RESISTING = "particles under pressure resist shear (docs/physics.md)"
+"""Why sheared blood is known to be more viscous than its law says."""
+
 SLAB = 8
 """Spacings along a periodic axis on which nothing depends."""
 

@@ -39,9 +39,7 @@ def momentum(report: Report, quick: bool) -> None:
     """Total momentum of blood in violent motion in a closed box, double precision."""
     d, n = 1e-3, 10
     generator = np.random.default_rng(1)
-    liquid = Liquid(
-        Casson(3.5e-3, 5e-3, 7.0), 1.0, d, background_pressure=50.0, artificial_viscosity=0.05
-    )
+    liquid = Liquid(Casson(3.5e-3, 5e-3, 7.0), 1.0, d, background_pressure=50.0)
 
     def velocity(x: np.ndarray) -> np.ndarray:
         return generator.normal(0.0, 0.05, x.shape)
@@ -63,7 +61,7 @@ def hydrostatic(report: Report, quick: bool) -> None:
     layers, d = (40 if quick else 60), 1e-3
     fill = layers * d
     c = MACH * math.sqrt(2.0 * GRAVITY * fill)
-    liquid = Liquid(Newtonian(VISCOSITY), c, d, artificial_viscosity=0.05)
+    liquid = Liquid(Newtonian(VISCOSITY), c, d)
     motion = flows.column(liquid, layers, GRAVITY)
     swing = 4.0 * fill / c  # period of the column's slowest sound
     scale = GRAVITY * fill
@@ -121,7 +119,7 @@ def dam_break(report: Report, quick: bool) -> None:
     width = 0.05715
     d = width / across
     c = MACH * math.sqrt(2.0 * GRAVITY * 2.0 * width)
-    liquid = Liquid(Newtonian(1e-3), c, d, artificial_viscosity=0.05)
+    liquid = Liquid(Newtonian(1e-3), c, d)
     motion = flows.dam(liquid, across, 5.0, GRAVITY)
     scaled = np.arange(0.2, 2.61, 0.2)
     fronts = []

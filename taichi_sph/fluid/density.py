@@ -34,15 +34,6 @@ from taichi_sph.particles.wall import wall_velocity
 
 
 @ti.func
-def pair_gradient(slope, r2, r, v):
-    """Part of a neighbour in the sums over grad W = slope r: v.grad W, grad W and its square.
-
-    r and v may be in any unit, r2 = r.r; the parts then are in it too.
-    """
-    return slope * v.dot(r), slope * r, slope * slope * r2
-
-
-@ti.func
 def density_of(fluid: ti.template(), unit: ti.template(), blood, wall):
     """Density from sum_j W_ij and sum_k V_k W_ik in a unit [kg/m^3]: rho_0 gives rho/rho_0.
 
@@ -69,15 +60,6 @@ def density_response(fluid: ti.template(), blood, wall, square):
 
 
 @ti.func
-def velocity_gradient_of(fluid: ti.template(), blood, wall):
-    """L_i from sum_j v_ji grad W_ij and sum_k V_k v_ki grad W_ik [1/s]."""
-    return (
-        ti.static(fluid.calibration.gradient * fluid.rest_volume) * blood
-        + ti.static(fluid.calibration.gradient * fluid.calibration.wall_gradient) * wall
-    )
-
-
-@ti.func
 def pair_crowding(fluid: ti.template(), w_ij):
     """Factor f_ij = 1 + 0.2 (W_ij/W(d))^4 of a pair in the concentration's gradient."""
     near = w_ij * ti.static(1.0 / float(fluid.kernel.w_of(fluid.spacing)))
@@ -85,11 +67,14 @@ def pair_crowding(fluid: ti.template(), w_ij):
 
 
 @ti.func
-def concentration_gradient(fluid: ti.template(), blood, wall):
-    """C_i from sum_j f_ij grad W_ij and sum_k V_k grad W_ik [1/m]."""
+def calibrated_gradient(fluid: ti.template(), gamma: ti.template(), blood, wall):
+    """L_i from sum_j v_ji grad W_ij and sum_k V_k v_ki grad W_ik [1/s] with gamma', or C_i.
+
+    C_i [1/m] is of sum_j f_ij grad W_ij and sum_k V_k grad W_ik with gamma''.
+    """
     return (
         ti.static(fluid.calibration.gradient * fluid.rest_volume) * blood
-        + ti.static(fluid.calibration.gradient * fluid.calibration.wall_concentration) * wall
+        + ti.static(fluid.calibration.gradient * gamma) * wall
     )
 
 
@@ -109,7 +94,6 @@ def density_sums(
     x_i = p.position[i]
     v_i = p.velocity[i]
     blood = fluid.kernel.w(0.0)
-    blood_rate = 0.0
     blood_gradient = ti.Vector([0.0, 0.0, 0.0])
     square = 0.0
     gradient = ti.Matrix.zero(float, 3, 3)
@@ -117,17 +101,15 @@ def density_sums(
     for n in range(nb.blood_count[i]):
         j = nb.blood_index[i, n]
         r_ij = nb.grid.separation(x_i, p.position[j])
-        r2 = r_ij.norm_sqr()
-        r = ti.sqrt(r2)
+        r = r_ij.norm()
         slope = fluid.kernel.slope(r)
         w_ij = fluid.kernel.w(r)
         v_ji = p.velocity[j] - v_i
         blood += w_ij
-        rate_ji, gradient_ij, square_ij = pair_gradient(slope, r2, r_ij, v_ji)
-        blood_rate -= rate_ji
+        gradient_ij = slope * r_ij
         blood_gradient += gradient_ij
-        square += square_ij
-        gradient += (slope * v_ji).outer_product(r_ij)
+        square += gradient_ij.norm_sqr()
+        gradient += v_ji.outer_product(gradient_ij)
         concentration += pair_crowding(fluid, w_ij) * gradient_ij
     wall = 0.0
     wall_sum = ti.Vector([0.0, 0.0, 0.0])
@@ -145,8 +127,8 @@ def density_sums(
     velocity_gradient -= v_i.outer_product(wall_sum)
     return (
         density_of(fluid, unit, blood, wall),
-        density_rate(fluid, blood_rate, -velocity_gradient.trace()),
+        density_rate(fluid, -gradient.trace(), -velocity_gradient.trace()),
         density_response(fluid, blood_gradient, wall_sum, square),
-        velocity_gradient_of(fluid, gradient, velocity_gradient),
-        concentration_gradient(fluid, concentration, wall_sum),
+        calibrated_gradient(fluid, fluid.calibration.wall_gradient, gradient, velocity_gradient),
+        calibrated_gradient(fluid, fluid.calibration.wall_concentration, concentration, wall_sum),
     )

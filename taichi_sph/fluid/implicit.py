@@ -30,7 +30,7 @@ from typing import Protocol
 
 import taichi as ti
 
-from taichi_sph.fluid.density import density_rate, density_sums, pair_gradient
+from taichi_sph.fluid.density import density_rate, density_sums
 from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import shear_rate
 from taichi_sph.fluid.shifting import shifting_velocity
@@ -218,16 +218,13 @@ def correct_pressure(
             j = nb.blood_index[i, n]
             r_ij = nb.grid.separation(x_i, p.position[j])
             v_ij = v_i - p.velocity[j] - interval * p.acceleration[j]
-            rate_ij, _, _ = pair_gradient(fluid.kernel.slope(r_ij.norm()), 0.0, r_ij, v_ij)
-            blood += rate_ij
+            blood += fluid.kernel.slope(r_ij.norm()) * v_ij.dot(r_ij)
         wall = 0.0
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
             v_ik = v_i - wall_velocity(w, k)
-            slope = w.volume[k] * fluid.kernel.slope(r_ik.norm())
-            rate_ik, _, _ = pair_gradient(slope, 0.0, r_ik, v_ik)
-            wall += rate_ik
+            wall += w.volume[k] * fluid.kernel.slope(r_ik.norm()) * v_ik.dot(r_ik)
         after = p.density[i] / rest_density - 1.0 + interval * density_rate(fluid, blood, wall)
         pressure_term[i] = ti.max(
             0.0, pressure_term[i] + ti.static(RELAXATION) * after / diagonal[i]

@@ -71,6 +71,7 @@ def make_fluid(
     alpha: float = 0.0,
     nested: bool = False,
     damping: float = 0.0,
+    thin: float = 0.0,
 ) -> Fluid:
     """A fluid of the stages; without a rheology its viscosity is zero."""
     return Fluid(
@@ -82,7 +83,7 @@ def make_fluid(
         artificial_viscosity=alpha,
         nested=nested,
         sound_damping=damping,
-        thin_viscosity=0.0,
+        thin_viscosity=thin,
     )
 
 
@@ -98,6 +99,8 @@ class Prescribed:
 
     law: Callable[[np.ndarray], np.ndarray]
     step: float
+    shifting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of every particle [m/s]."""
     name: str = "prescribed"
     used_fallback: bool = False
     pair_coefficients: None = None
@@ -109,7 +112,7 @@ class Prescribed:
         acceleration[:live] = self.law(particles.position.to_numpy()[:live].astype(float))
         particles.acceleration.from_numpy(acceleration)
         particles.density.fill(DENSITY)
-        particles.shifting.fill(0.0)
+        particles.shifting.fill(self.shifting)
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """The step that the test chose [s]."""
@@ -194,6 +197,7 @@ class Setup:
             background=fluid.equation_of_state.background_pressure,
             alpha=fluid.artificial_viscosity,
             damping=fluid.sound_damping,
+            thin=fluid.thin_viscosity,
             eta=rheology.eta,
             tau_y=getattr(rheology, "tau_y", 0.0),
             n=getattr(rheology, "n", 0.0),

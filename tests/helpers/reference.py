@@ -76,6 +76,7 @@ class Blood:
     background: float
     alpha: float
     damping: float
+    thin: float
     eta: float
     tau_y: float
     n: float
@@ -182,20 +183,28 @@ class Blood:
         w = -np.minimum(factor * rate, 0.2 * frequency)[:, None] * h**2
         w = w * self.concentration_gradient()
         size = np.linalg.norm(w, axis=1)
-        surrounded = np.clip((self.rho / self.rest_density - 0.93) / 0.05, 0.0, 1.0)
-        return (surrounded * np.minimum(1.0, rate * h / np.maximum(size, 1e-30)))[:, None] * w
+        part = self.surrounded(self.rho) * np.minimum(1.0, rate * h / np.maximum(size, 1e-30))
+        return part[:, None] * w
 
     def pressure_acceleration(self) -> np.ndarray:
         """Eq. 13, with the calibration of the gradient [m/s^2]."""
         q = self.factors["gradient"] * self.pressure_term()
         return -self.mass * np.einsum("ij,ija->ia", q[:, None] + q[None, :], self.grad)
 
+    def surrounded(self, rho: np.ndarray) -> np.ndarray:
+        """0 under 0.93 of the rest density, 1 over 0.98."""
+        return np.clip((rho / self.rest_density - 0.93) / 0.05, 0.0, 1.0)
+
+    def alpha_at(self, rho: np.ndarray) -> np.ndarray:
+        """Monaghan's alpha: everywhere, and of thin blood beside it."""
+        return self.alpha + self.thin * (1.0 - self.surrounded(rho))
+
     def artificial_acceleration(self) -> np.ndarray:
         """Monaghan (1992): Pi = -alpha h_s c (v.r)/(r^2 + eps)/mean rho, approaching pairs only."""
         vr = np.minimum(0.0, np.einsum("ija,ija->ij", self.v_ij, self.r))
         mean = 0.5 * (self.rho[:, None] + self.rho[None, :])
         mu = (self.support / 2.0) * vr / ((self.r**2).sum(-1) + self.eps)
-        pi = -self.alpha * self.sound_speed * mu / mean
+        pi = -self.alpha_at(mean) * self.sound_speed * mu / mean
         return -self.mass * np.einsum("ij,ija->ia", pi, self.grad)
 
     def viscous_acceleration(self) -> np.ndarray:
@@ -236,7 +245,7 @@ class Blood:
         psi = self.factors["wall_density"] * self.rest_density * self.volume
         vr = np.minimum(0.0, np.einsum("ia,ika->ik", self.v, self.r_wall))
         mu = (self.support / 2.0) * vr / ((self.r_wall**2).sum(-1) + self.eps)
-        pi = -self.alpha * self.sound_speed * mu / self.rho[:, None]
+        pi = -self.alpha_at(self.rho[:, None]) * self.sound_speed * mu / self.rho[:, None]
         return -np.einsum("ik,k,ika->ia", pi, psi, self.grad_wall)
 
     def wall_friction_acceleration(self, nested: bool = False) -> np.ndarray:

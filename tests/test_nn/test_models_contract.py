@@ -120,6 +120,19 @@ def test_a_model_writes_finite_accelerations_and_densities_and_nothing_else(mode
         np.testing.assert_array_equal(field.to_numpy(), values)
 
 
+@pytest.mark.parametrize(
+    "name", ["physics", "nested physics", "implicit", "direct head", "pressure head"]
+)
+def test_every_model_shifts_particles_alike_but_for_its_step(name):
+    stage, model = sphere(), model_named(name)
+    put(stage, *blood(SPHERE - 0.2 * D))
+    accelerations(stage, model)
+    frequency = FLUID.sound_frequency if "physics" in name else 1.0 / SCALES.frame_interval
+    expected = stage.reference(FLUID).shifting(FLUID.shifting, frequency)
+    found = stage.in_order(stage.particles.shifting)
+    assert_close(found, expected, {"f64": 1e-10, "f32": 2e-3}[precision()])
+
+
 def test_a_model_gives_bitwise_the_same_twice(model):
     stage, state = sphere(), blood(SPHERE - 0.2 * D)
     put(stage, *state)

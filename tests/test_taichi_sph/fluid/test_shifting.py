@@ -6,6 +6,7 @@ import pytest
 from builders import (
     SPHERE,
     D,
+    Prescribed,
     Setup,
     ball,
     cubic_lattice,
@@ -77,7 +78,7 @@ def test_blood_at_a_free_surface_is_not_shifted():
     assert np.abs(found[thin]).max() == 0.0
 
 
-def test_a_lattice_is_even_even_in_its_first_layer_at_a_wall():
+def test_a_lattice_is_even_and_so_is_its_first_layer_at_a_wall():
     stage = plane()
     x = cubic_lattice(8, 8, 5)
     stage.put(x, sheared(x))
@@ -109,28 +110,11 @@ def test_the_integrator_shifts_positions_and_not_velocities():
     stage = in_a_box()
     p = stage.particles
     x, v = stage.in_order(p.position), stage.in_order(p.velocity)
-    without = stage.simulation(Still(0.0))
-    without.step(1e-6)
+    stage.simulation(Prescribed(np.zeros_like, 1.0)).step(1e-6)
     plain = stage.in_order(p.position)
     stage.put(x, v)
-    stage.simulation(Still(0.3)).step(1e-6)
+    stage.simulation(Prescribed(np.zeros_like, 1.0, (0.3, 0.0, 0.0))).step(1e-6)
     np.testing.assert_allclose(
         stage.in_order(p.position)[:, 0] - plain[:, 0], 0.3e-6, rtol=0, atol=1e-4 * D
     )
     np.testing.assert_array_equal(stage.in_order(p.velocity), v)
-
-
-class Still:
-    """No acceleration, and a shifting along x [m/s]."""
-
-    name, used_fallback, pair_coefficients = "still", False, None
-
-    def __init__(self, shift: float):
-        self.shift = shift
-
-    def accelerate(self, particles, wall, neighbors, gravity) -> None:
-        particles.acceleration.fill(0.0)
-        particles.shifting.fill([self.shift, 0.0, 0.0])
-
-    def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
-        return 1.0

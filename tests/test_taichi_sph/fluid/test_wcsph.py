@@ -47,12 +47,16 @@ PRESSURE = make_fluid(background=300.0)
 ARTIFICIAL = make_fluid(background=-1e9, alpha=0.3)
 VISCOUS = make_fluid(sound_speed=0.0, rheology=Newtonian(3.5e-3))
 DAMPING = make_fluid(background=300.0, damping=1.0)
-BLOOD = make_fluid(background=300.0, rheology=CASSON, alpha=0.05, damping=1.0)
-NESTED = make_fluid(background=300.0, rheology=CASSON, alpha=0.05, nested=True, damping=1.0)
+THIN = make_fluid(background=-1e9, thin=0.3)
+# As scenes have it, and the scene's own alpha beside.
+SCENE: dict = {"rheology": CASSON, "alpha": 0.05, "damping": 1.0, "thin": 0.05}
+BLOOD = make_fluid(background=300.0, **SCENE)
+NESTED = make_fluid(background=300.0, nested=True, **SCENE)
 
 CONSERVING = {
     "pressure": PRESSURE,
     "artificial": ARTIFICIAL,
+    "thin": THIN,
     "damping of sound": DAMPING,
     "viscous": VISCOUS,
     "blood": BLOOD,
@@ -165,6 +169,16 @@ def test_the_damping_of_sound_takes_what_work_it_does_against_compression(place)
     )
     # -sum_i m q_i rho_0 (d(rho/rho_0)/dt)_i: with the derivative's own rate it is a square.
     assert (work * force).sum() < 0.0
+
+
+def test_thin_blood_has_an_artificial_viscosity_and_other_blood_has_none():
+    stage = near_the_wall(19)
+    found, blood = stage.accelerate(THIN), stage.reference(THIN)
+    thin = blood.surrounded(blood.rho)
+    assert (thin == 0.0).any() and (thin == 1.0).any() and ((thin > 0.0) & (thin < 1.0)).any()
+    assert blood.p.max() == 0.0
+    expected = blood.artificial_acceleration(), blood.wall_artificial_acceleration()
+    assert_parts_add_up(found, *expected, "near the wall")
 
 
 def test_lone_drop_feels_the_walls_pressure_of_equation_15():
