@@ -113,6 +113,12 @@ def hydrostatic(report: Report, quick: bool) -> None:
     )  # fmt: skip
 
 
+TOO_FAST = (
+    "the thin front is braked less than with the artificial viscosity that scenes had (8.3 %)"
+)
+"""Why the collapsing column's front is known to run ahead."""
+
+
 def dam_break(report: Report, quick: bool) -> None:
     """Front of a collapsing column against Martin and Moyce's experiment."""
     across = 12 if quick else 20
@@ -132,7 +138,7 @@ def dam_break(report: Report, quick: bool) -> None:
     report.add(
         f"dam break, column {across} wide: front, L2 from t sqrt(2g/a) = 1.2 to 2.6",
         f"x/a {fronts[-1]:.3f} at {scaled[-1]:.1f}", f"{measured[-1]:.3f} (measured)",
-        relative_l2(np.array(fronts)[late], measured[late]), 0.1,
+        relative_l2(np.array(fronts)[late], measured[late]), 0.1, TOO_FAST,
     )  # fmt: skip
     report.draw(
         "dam-break", "t sqrt(2g/a)", "x/a",
