@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from driven_tube import DENSITY, ENDS, LENGTH, OF_ONE, D, area, drive, make_tube
+from driven_tube import DENSITY, ENDS, LENGTH, OF_ONE, VISCOSITY, D, area, drive, make_tube
+from meshes import RADIUS
 from taichi_sph.boundary.inflow import buffer_layers
 from taichi_sph.simulation import Simulation
 
 REST = 0.02
 """Of the jet's speed that the pressure would make, sqrt(2 p/rho): sound still rings."""
+SAME = 0.03
+"""Of the pressure: two plugs whose particles are packed differently press so much differently."""
 RINGING = 0.05
 """Of the pressure: its mean over a few periods of the sound that is left."""
 PUSHED = 0.1
@@ -44,7 +47,10 @@ def test_blood_between_reservoirs_of_one_pressure_comes_to_rest_under_it(driven,
     jet = math.sqrt(2.0 * 100.0 / DENSITY)
     # It has moved: the lattice leaves room at the wall, which is filled first.
     assert np.abs(speeds).max() > 0.1 * jet
-    assert np.abs(speeds[-25:].mean(axis=0)).max() < 0.5 * REST * jet
+    # What drifts on is what a few per cent of the pressure would drive (Poiseuille).
+    length = driven.particles.count[None] * OF_ONE / area(driven)
+    loss = 8.0 * VISCOSITY * length * np.abs(speeds[-25:].mean(axis=0)).max() / RADIUS**2
+    assert loss < SAME * 100.0
     assert math.sqrt((speeds[-25:] ** 2).mean()) < REST * jet
     # A plug presses with p on what its strands take up; the blood before it is on all the opening.
     taken = area(driven) / driven.inflow.openings[0].opening.area
