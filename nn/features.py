@@ -82,9 +82,9 @@ class FeatureScales:
     spacing: float
     """d [m]."""
     frame_interval: float
-    """T [s]."""
+    """T at the start [s]; it goes with 1/c."""
     sound_speed: float
-    """c [m/s]."""
+    """c at the start [m/s]."""
     wall_spacing_ratio: float = 1.0
     """Proxy spacing over d."""
 
@@ -177,6 +177,7 @@ def blood_features(
     fluid: ti.template(),
     scales: ti.template(),
     inputs: ti.template(),
+    interval,
 ):
     """Write rows 3 to 15 of particle i; lengths in R, velocities in U.
 
@@ -186,7 +187,7 @@ def blood_features(
     x_i = p.position[i]
     v_i = p.velocity[i]
     per_length = ti.static(1.0 / scales.support_radius)
-    per_speed = ti.static(1.0 / scales.speed)
+    per_speed = interval * ti.static(1.0 / (scales.speed * scales.frame_interval))
     blood = fluid.kernel.w(0.0)
     velocity_gradient = ti.Matrix.zero(float, 3, 3)
     gradient = ti.Vector([0.0, 0.0, 0.0])
@@ -306,6 +307,7 @@ def features_of(
     fluid: ti.template(),
     scales: ti.template(),
     inputs: ti.template(),
+    interval,
 ):
     """All rows of the table for particle i, dimensionless (its last column); its shifting [m/s].
 
@@ -314,28 +316,27 @@ def features_of(
     """
     f = ti.Vector([0.0] * ROW_COUNT)
     if ti.static(inputs.among(ACCELERATION, ACCELERATION + 1, ACCELERATION + 2)):
-        a_i = p.acceleration[i] * ti.static(1.0 / scales.acceleration)
+        a_i = p.acceleration[i] * (interval * interval * ti.static(1.0 / scales.support_radius))
         for a in ti.static(range(3)):
             f[ACCELERATION + a] = a_i[a]
     blood, blood_rates, blood_gradient, square, crowding = blood_features(
-        f, i, p, nb, fluid, scales, inputs
+        f, i, p, nb, fluid, scales, inputs, interval
     )
     wall, wall_rates, wall_gradient = wall_features(f, i, p, w, nb, fluid, scales, inputs)
     f[DENSITY_RATIO] = density_of(fluid, fluid.rest_density, blood, wall)
     f[COMPRESSION] = 50.0 * ti.max(0.0, f[DENSITY_RATIO] - 1.0)
     # Lengths in the gradients are in R: each is R times what it gives, and R^2 D is R^4 times.
     radius = ti.static(scales.support_radius)
-    blood_rates *= ti.static(scales.speed)
+    blood_rates *= ti.static(scales.speed * scales.frame_interval) / interval
     rate = -density_rate(fluid, blood_rates.trace(), wall_rates.trace())
-    f[DIVERGENCE] = -rate * ti.static(scales.support_radius * scales.frame_interval)
+    f[DIVERGENCE] = -rate * ti.static(scales.support_radius) * interval
     sheared = radius * shear_rate(
         calibrated_gradient(fluid, fluid.calibration.wall_gradient, blood_rates, wall_rates)
     )
     concentration = -radius * calibrated_gradient(
         fluid, fluid.calibration.wall_concentration, crowding, wall_gradient
     )
-    steps = ti.static(1.0 / scales.frame_interval)
-    shifting = shifting_velocity(fluid, f[DENSITY_RATIO], sheared, concentration, steps)
+    shifting = shifting_velocity(fluid, f[DENSITY_RATIO], sheared, concentration, 1.0 / interval)
     response = density_response(fluid, blood_gradient, wall_gradient, square)
     f[RESPONSE] = ti.static(scales.support_radius**4) * response
     return f, shifting
@@ -352,6 +353,6 @@ def extract(
 ):
     """What `features_of` gives, for every live particle.  Writes: out[identity, ROW_COUNT]."""
     for i in range(p.count[None]):
-        f, _ = features_of(i, p, w, nb, fluid, scales, ALL)
+        f, _ = features_of(i, p, w, nb, fluid, scales, ALL, ti.static(scales.frame_interval))
         for k in ti.static(range(ROW_COUNT)):
             out[p.identity[i], k] = f[k]

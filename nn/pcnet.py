@@ -176,6 +176,7 @@ class DirectPcNet:
         """Make the scratch fields for `capacity` particles."""
         self.network = Network.upload(weights)
         self.fluid = replace(fluid, rheology=VARIABLE, nested=False)
+        self.sound_speed = fluid.sound_speed
         self.scales = scales
         self.physics = SphAcceleration(fluid, capacity)
         self.guarded = guarded
@@ -184,7 +185,12 @@ class DirectPcNet:
         self.next_acceleration = ti.Vector.field(3, float, capacity)
 
     @property
-    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
+    def interval(self) -> float:
+        """Present step T [s]."""
+        return self.scales.frame_interval * (self.fluid.sound_speed / self.sound_speed)
+
+    @property
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float] | None:
         """Forces come from pairs only where the physics took over."""
         return self.physics.pair_coefficients if self.used_fallback else None
 
@@ -198,10 +204,11 @@ class DirectPcNet:
         """Features and network; or the physics."""
         alarms = predict_acceleration(
             particles, wall, neighbors, self.fluid, self.scales, self.network,
-            self.next_acceleration,
+            self.next_acceleration, self.interval,
         )  # fmt: skip
         self.used_fallback = self.guarded and alarms > 0
         if self.used_fallback:
+            self.physics.sound_speed = self.sound_speed
             self.physics.accelerate(particles, wall, neighbors, gravity)
         else:
             copy_vectors(particles, self.next_acceleration)
@@ -210,7 +217,7 @@ class DirectPcNet:
         """The trained step [s], or less: LARGEST_ADVECTIVE_CFL at most, or the physics' own."""
         if self.used_fallback:
             return self.physics.stable_step(largest_speed, largest_acceleration)
-        return advective_step(self.scales.frame_interval, self.scales.support_radius, largest_speed)
+        return advective_step(self.interval, self.scales.support_radius, largest_speed)
 
 
 class PressurePcNet:
@@ -236,8 +243,17 @@ class PressurePcNet:
         self.stable_step = self.implicit.stable_step
 
     @property
-    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field]:
-        """Constants, p/rho^2 and mu of the implicit model."""
+    def sound_speed(self) -> float:
+        """Present sound speed c [m/s]: the implicit model's."""
+        return self.implicit.sound_speed
+
+    @sound_speed.setter
+    def sound_speed(self, sound_speed: float) -> None:
+        self.implicit.sound_speed = sound_speed
+
+    @property
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float]:
+        """Constants, p/rho^2, mu and c of the implicit model."""
         return self.implicit.pair_coefficients
 
     def estimate(
@@ -247,7 +263,7 @@ class PressurePcNet:
         stiffness, damping = largest_factors(model.iterations)
         predict_pressure(
             particles, wall, neighbors, model.fluid, self.scales, self.network, stiffness, damping,
-            self.eta, model.pressure_term, model.viscosity, model.diagonal,
+            self.eta, model.pressure_term, model.viscosity, model.diagonal, model.interval,
         )  # fmt: skip
 
 
@@ -290,10 +306,10 @@ def load_pcnet(path: Path, scene: Scene, guarded: bool = True) -> Callable[[Flui
 
 
 @ti.func
-def beyond_training(f, velocity, scales: ti.template()):
+def beyond_training(f, velocity, scales: ti.template(), interval):
     """1 if a particle with these features must not be left to a network, else 0."""
     dense = f[DENSITY_RATIO] > ti.static(1.0 + LARGEST_COMPRESSION)
-    fast = velocity.norm() > ti.static(LARGEST_ADVECTIVE_CFL * scales.speed_limit)
+    fast = velocity.norm() * interval > ti.static(LARGEST_ADVECTIVE_CFL * scales.support_radius)
     return int(dense or fast)
 
 
@@ -306,6 +322,7 @@ def predict_acceleration(
     scales: ti.template(),
     network: ti.template(),
     out: ti.template(),
+    interval: float,
 ) -> int:
     """a_i^{n+1} = net(F_i) (paper, Algorithm 2); it knows gravity or nothing does.
 
@@ -313,12 +330,12 @@ def predict_acceleration(
     """
     alarms = 0
     for i in range(p.count[None]):
-        f, p.shifting[i] = features_of(i, p, w, nb, fluid, scales, network.inputs)
-        alarms += beyond_training(f, p.velocity[i], scales)
+        f, p.shifting[i] = features_of(i, p, w, nb, fluid, scales, network.inputs, interval)
+        alarms += beyond_training(f, p.velocity[i], scales, interval)
         p.density[i] = f[DENSITY_RATIO] * ti.static(fluid.rest_density)
         o = evaluate(network, f)
         for a in ti.static(range(3)):
-            out[i][a] = o[a] * ti.static(scales.acceleration)
+            out[i][a] = o[a] * ti.static(scales.support_radius) / (interval * interval)
     return alarms
 
 
@@ -349,21 +366,21 @@ def predict_pressure(
     pressure_term: ti.template(),
     viscosity: ti.template(),
     diagonal: ti.template(),
+    interval: float,
 ):
     """The pressure head's q^0, mu and T^2 rho_0 D.
 
     Writes: pressure_term, viscosity, diagonal, density, shifting.
     """
     rest_density = ti.static(fluid.rest_density)
-    thickest = ti.static(
-        LARGEST_VISCOSITY * fluid.rest_density * scales.support_radius * scales.speed_limit
+    thickest = (
+        ti.static(LARGEST_VISCOSITY * fluid.rest_density * scales.support_radius**2) / interval
     )
+    unit = ti.static(fluid.rest_density / scales.support_radius**2) * interval * interval
     for i in range(p.count[None]):
-        f, p.shifting[i] = features_of(i, p, w, nb, fluid, scales, network.inputs)
+        f, p.shifting[i] = features_of(i, p, w, nb, fluid, scales, network.inputs, interval)
         p.density[i] = f[DENSITY_RATIO] * rest_density
-        diagonal[i] = ti.static(fluid.rest_density / scales.speed_limit**2) * ti.max(
-            SMALLEST_DIAGONAL, f[RESPONSE]
-        )
+        diagonal[i] = unit * ti.max(SMALLEST_DIAGONAL, f[RESPONSE])
         o = evaluate(network, f)
         excess = largest_stiffness * sigmoid(o[0]) * (f[DENSITY_RATIO] - 1.0)
         excess -= largest_damping * sigmoid(o[1]) * f[DIVERGENCE]

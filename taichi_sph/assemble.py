@@ -1,12 +1,13 @@
 """Assembly: the parts of a simulation from a scene and its vessel."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
+from taichi_sph.boundary.datum import PressureDatum
 from taichi_sph.boundary.flow_extension import buffer_sites, flow_extension
 from taichi_sph.boundary.inflow import (
     HYSTERESIS,
@@ -41,6 +42,7 @@ from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
 from taichi_sph.scene import Scene
+from taichi_sph.settling import settle
 from taichi_sph.waveform import read_waveform
 
 SKIN = 0.1
@@ -52,6 +54,8 @@ OPENING_REACH = BEYOND
 """Blood beyond an opening's plane has left by it within this many radii of its centre, or nearer
 where another branch passes."""
 
+FILLING_ROUNDS = 8
+"""Most lattices that are tried to fill a lumen."""
 PACKING = 1.1
 """Blood that flows in may pack the vessel closer than the lattice at the start by this factor."""
 
@@ -112,6 +116,8 @@ class InitialState:
 
     blood: Floats
     """Positions [m], (n, 3)."""
+    in_lumen: int
+    """Of them in the lumen, the first; those of buffers follow."""
     left_out: int
     """Sites that hold no blood, for they are too near to a proxy."""
     wall: WallSample
@@ -158,7 +164,13 @@ def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
     )  # fmt: skip
     neighbors = _make_neighbors(plan, particles.capacity, wall)
     blood = BloodFlow(particles, wall, neighbors, scene.gravity)
-    return Assembly(scene, vessel, derived, fluid, initial, blood, _make_boundaries(plan, blood))
+    boundaries = _make_boundaries(plan, blood, derived)
+    if scene.column.full:
+        inflow = next(b for b in boundaries if isinstance(b, BufferZones))
+        initial = settle(blood, fluid, inflow, start.in_lumen)
+        derived = replace(derived, blood_particles=len(initial))
+        inflow.reset()  # identities go on after those that are left
+    return Assembly(scene, vessel, derived, fluid, initial, blood, boundaries)
 
 
 def _make_plan(scene: Scene, vessel: Vessel) -> _Plan:
@@ -206,15 +218,14 @@ def _initial_state(plan: _Plan, seed: int) -> InitialState:
     setback = plan.calibration.setback
     sample = plan.vessel.sample_wall(plan.wall_spacing, setback, seed)
     proxies, normals, amplitudes = _proxies(plan, sample)
-    blood = _fill(plan)
-    clear = clear_of_proxies(blood, proxies, plan.spacing, setback)
-    if not clear.any():
-        raise InputError(
-            f"column: no place at {plan.scene.column.opening!r} is far enough from the wall at "
-            f"spacing {plan.spacing:g} m; choose a finer spacing"
-        )
-    left_out = int((~clear).sum())
-    return InitialState(blood[clear], left_out, sample, setback, proxies, normals, amplitudes)
+    column, left_out = _column(plan, proxies, plan.spacing)
+    if plan.scene.column.full:
+        column, left_out = _full_lumen(plan, proxies, column), 0
+    buffers = buffer_blood(plan.driven, column, plan.spacing, plan.layers)
+    clear = clear_of_proxies(buffers, proxies, plan.spacing, setback)
+    blood = np.concatenate([column, buffers[clear]])
+    left_out += int((~clear).sum())
+    return InitialState(blood, len(column), left_out, sample, setback, proxies, normals, amplitudes)
 
 
 def _proxies(plan: _Plan, sample: WallSample) -> tuple[Floats, Floats, Floats]:
@@ -245,15 +256,46 @@ def _proxies(plan: _Plan, sample: WallSample) -> tuple[Floats, Floats, Floats]:
     return np.concatenate(positions), np.concatenate(normals), np.concatenate(amplitudes)
 
 
-def _fill(plan: _Plan) -> Floats:
-    """Blood at the start (n, 3) [m]: the column, where the tool leaves it room, and the buffers."""
-    column = plan.vessel.fill_column(plan.scene.column, plan.spacing)
+def _column(plan: _Plan, proxies: Floats, spacing: float) -> tuple[Floats, int]:
+    """A lattice in the column (n, 3) [m], and how many of its places the proxies take.
+
+    Raises:
+        InputError: the column does not fit, or the proxies take all of its places.
+    """
+    column = plan.vessel.fill_column(plan.scene.column, spacing)
     if plan.tool is not None and len(column):
         apart = column - plan.tool_position
-        clear = plan.tool.distance(apart) > 0.5 * plan.spacing
+        clear = plan.tool.distance(apart) > 0.5 * spacing
         column = column[clear & plan.tool.outside(apart)]
-    buffers = buffer_blood(plan.driven, column, plan.spacing, plan.layers)
-    return np.concatenate([column, buffers])
+    clear = clear_of_proxies(column, proxies, spacing, plan.calibration.setback)
+    if not clear.any():
+        raise InputError(
+            f"column: no place at {plan.scene.column.opening!r} is far enough from the wall at "
+            f"spacing {plan.spacing:g} m; choose a finer spacing"
+        )
+    return column[clear], int((~clear).sum())
+
+
+def _full_lumen(plan: _Plan, proxies: Floats, column: Floats) -> Floats:
+    """As many particles as the lumen has room for (n, 3) [m]: places of a finer lattice.
+
+    A lattice of the blood's own spacing, `column`, leaves a void at the wall.  These are too close
+    to each other, until `taichi_sph.settling` lets them go.
+    """
+    room = plan.vessel.volume
+    if plan.tool is not None:
+        places = plan.vessel.fill_column(plan.scene.column, plan.spacing)
+        room -= (~plan.tool.outside(places - plan.tool_position)).sum() * plan.spacing**3
+    wanted = round(room / plan.spacing**3)
+    spacing = plan.spacing
+    for _ in range(FILLING_ROUNDS):
+        if len(column) >= wanted:
+            break
+        # A little finer than in proportion, for what is cut off at the wall does not shrink alike.
+        spacing *= 0.999 * (len(column) / wanted) ** (1.0 / 3.0)
+        column, _ = _column(plan, proxies, spacing)
+    kept = np.random.default_rng(0).permutation(len(column))[:wanted]
+    return column[np.sort(kept)]
 
 
 def _room(plan: _Plan, count: int) -> int:
@@ -294,11 +336,12 @@ def _make_neighbors(plan: _Plan, capacity: int, wall: Wall) -> Neighbors:
     return Neighbors.allocate(grid, radius, skin, capacity, plan.spacing, wall, used)
 
 
-def _make_boundaries(plan: _Plan, blood: BloodFlow) -> tuple[Boundary, ...]:
+def _make_boundaries(plan: _Plan, blood: BloodFlow, derived: Derived) -> tuple[Boundary, ...]:
     """All boundaries of a scene, in the order in which they are asked.
 
     What has left is marked first, so that suction finds only what is still there, and blood that is
     added is not taken before it has moved.  Suction asks how far the tool has moved, after it has.
+    Reservoirs drive with what their pressure is over the datum.
     """
     scene, vessel, spacing = plan.scene, plan.vessel, plan.spacing
     outlets = Outlets(blood, len(vessel.openings) + MOST_WOUNDS)
@@ -313,13 +356,18 @@ def _make_boundaries(plan: _Plan, blood: BloodFlow) -> tuple[Boundary, ...]:
     inflow = BufferZones(
         blood, plan.driven, spacing, plan.kernel.support_radius, scene.blood.density
     )
+    wounds = Wounds(blood, vessel, outlets, len(vessel.openings), plan.kernel, spacing)
     boundaries: list[Boundary] = [
         outlets,
         tool,
         Suction(blood, outlets, tool, spacing),
+        PressureDatum(
+            blood, plan.driven, wounds, scene.blood.density, derived.sound_speed,
+            scene.discretization.sound_speed_ratio, derived.quiet_speed,
+        ),
         inflow,
         Tracer(blood, inflow, outlets),
-        Wounds(blood, vessel, outlets, len(vessel.openings), plan.kernel, spacing),
+        wounds,
     ]  # fmt: skip
     if plan.motion is not None:
         boundaries.append(MovingWall(blood, plan.motion))

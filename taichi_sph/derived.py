@@ -1,6 +1,7 @@
 """Numbers that follow from a scene; printed, never typed."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,8 @@ class Derived:
     """See the function of that name [m/s]."""
     sound_speed: float
     """c [m/s]: the scene's ratio times the expected speed."""
+    quiet_speed: float | None
+    """Of a closed scene, see the function of that name [m/s]; else None."""
     step: float
     """Time step at the expected speed [s], before force limits."""
     reynolds_number: float
@@ -50,15 +53,52 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
     if g > 0.0:
         along = vessel.vertices @ (gravity / g)
         head = g * float(along.max() - along.min())
-    highest = lowest = flow = 0.0
+    pressures = [(0.0, 0.0), *_reservoir_pressures(scene)]
+    span = max(high for _, high in pressures) - min(low for low, _ in pressures)
+    return _fastest(scene, vessel, math.sqrt(2.0 * (head + span / scene.blood.density)))
+
+
+def is_closed(scene: Scene) -> bool:
+    """Whether blood fills the lumen and no opening leads outside, but one at least to a reservoir.
+
+    Only differences of pressure move blood then, until a wound is opened.
+    """
+    uncapped = [table for table in scene.openings.values() if table.state == "open"]
+    return (
+        scene.column.full
+        and all(table.driven for table in uncapped)
+        and any(table.pressure is not None for table in uncapped)
+    )
+
+
+def quiet_speed(scene: Scene, vessel: Vessel) -> float:
+    """Largest speed that the drive of a closed scene gives blood while nothing is wounded [m/s].
+
+    As `expected_speed`, without gravity, with the reservoirs' pressures among themselves, and each
+    of them with its part of what pumps drive.
+    """
+    pressures = list(_reservoir_pressures(scene))
+    span = max(high for _, high in pressures) - min(low for low, _ in pressures)
+    jet = math.sqrt(2.0 * span / scene.blood.density)
+    # Where only a wound lets blood flow: as fast as out of it.
+    return _fastest(scene, vessel, jet, 1.0 / len(pressures)) or math.inf
+
+
+def _reservoir_pressures(scene: Scene) -> Iterator[tuple[float, float]]:
+    """Lowest and highest pressure of each reservoir in a beat [Pa]."""
     for table in scene.openings.values():
-        if table.driven:
+        if table.pressure is not None:
+            pressure = read_waveform(table.waveform, Path(scene.folder)).factor * table.pressure
+            yield float(pressure.min()), float(pressure.max())
+
+
+def _fastest(scene: Scene, vessel: Vessel, jet: float, part: float = 1.0) -> float:
+    """Largest speed beside a jet's [m/s]: of a part of what pumps drive, and a wall that pulses."""
+    flow = 0.0
+    for table in scene.openings.values():
+        if table.flow is not None:
             wave = read_waveform(table.waveform, Path(scene.folder)).factor
-            pressure = wave * (table.pressure or 0.0)
-            highest = max(highest, float(pressure.max()))
-            lowest = min(lowest, float(pressure.min()))
-            flow += float(np.abs(wave * (table.flow or 0.0)).max())
-    jet = math.sqrt(2.0 * (head + (highest - lowest) / scene.blood.density))
+            flow += float(np.abs(wave * table.flow).max())
     squeezed = 0.0
     motion = read_wall_motion(scene, vessel)
     if motion is not None:
@@ -66,7 +106,7 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
         speed = motion.amplitude * motion.peak_rate
         squeezed = 2.0 * vessel.wall_area * speed / area if area else speed
     if flow > 0.0:
-        jet = max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
+        jet = max(jet, 2.0 * part * flow / (0.25 * math.pi * vessel.narrowest**2))
     return jet + squeezed
 
 
@@ -88,6 +128,7 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
         support_radius=radius,
         expected_speed=speed,
         sound_speed=sound,
+        quiet_speed=min(quiet_speed(scene, vessel), speed or 1.0) if is_closed(scene) else None,
         step=limits.smallest,
         reynolds_number=scene.blood.density * speed * narrowest / scene.blood.rheology.viscosity,
         particles_across_narrowest=narrowest / grid.spacing,

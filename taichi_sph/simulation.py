@@ -115,12 +115,18 @@ class Simulation:
         p, w, nb = self.particles, self.wall, self.neighbors
         if nb.stale:
             self.rebuild_lists()
-        self.model.accelerate(p, w, nb, self.gravity)
+        self._accelerate(self.model)
         dt = self._choose_step(remaining)
         wall_moved = sum(b.before_drift(dt, self.model) for b in self.boundaries)
         blood_moved2, corrected = kick_drift(p, w, nb, self._inflow, self.as_printed, dt)
         nb.note_drift(math.sqrt(blood_moved2), wall_moved)
         self._count_step(dt, int(corrected))
+
+    def _accelerate(self, model: AccelerationModel) -> None:
+        """Let a model compute accelerations, at the sound speed and from the datum of now."""
+        if self.blood.sound_speed:
+            model.sound_speed = self.blood.sound_speed
+        model.accelerate(self.particles, self.wall, self.neighbors, self.blood.felt_gravity)
 
     def rebuild_lists(self) -> None:
         """Let boundaries add and remove blood, and build the lists for it as it stands.
@@ -142,6 +148,7 @@ class Simulation:
         speed, acceleration, broken = largest_speed_and_acceleration(self.particles)
         if broken or speed > self.speed_limit:
             raise RunError(describe_divergence(self, int(broken)))
+        self.blood.largest_speed = speed
         stable = min(self.model.stable_step(speed, acceleration), self.step_limit)
         # Equal steps to the end of the frame, so that none is a sliver.
         return remaining / max(1, math.ceil(remaining / stable * (1.0 - 1e-9)))
@@ -310,7 +317,7 @@ class Simulation:
         self.neighbors.build(self.particles, self.wall)
         for model in models:
             acceleration = self.particles.acceleration.to_numpy()
-            model.accelerate(self.particles, self.wall, self.neighbors, self.gravity)
+            self._accelerate(model)
             self.particles.acceleration.from_numpy(acceleration)
             for boundary in self.boundaries:
                 boundary.compile_kernels(model)
@@ -439,6 +446,19 @@ class Simulation:
         identity, position, velocity = self.particles.live()
         order = np.argsort(identity)
         return position[order], velocity[order]
+
+    def pressures(self) -> np.ndarray:
+        """Pressures of the live blood in the last step [Pa], (n,), in order of identity.
+
+        Raises:
+            LookupError: the model knows none.
+        """
+        coefficients = self.model.pair_coefficients
+        if coefficients is None:
+            raise LookupError(f"{self.model.name} gives accelerations and no pressure")
+        density = self.particles.in_order(self.particles.density).astype(float)
+        above = self.particles.in_order(coefficients[1]).astype(float) * density**2
+        return np.asarray(above + self.blood.datum.at(self.positions().astype(float)))
 
     def identities(self) -> np.ndarray:
         """Identities of the live blood, ascending, shape (n,)."""

@@ -21,6 +21,7 @@ ROOMS = (
     "taichi_sph.fluid",
     "taichi_sph.boundary",
     "taichi_sph.integrator",
+    "taichi_sph.settling",
     "taichi_sph.derived",
     "taichi_sph.diagnostics",
     "taichi_sph.state",

@@ -157,17 +157,17 @@ def measure_passes(
     fluid = replace(simulation.fluid, nested=False)
     scratch = implicit.pressure_term, implicit.viscosity
     shallow = PressurePcNet(replace(full, layers=(flat,)), fluid, net.scales, p.capacity)
-    gravity, stress = scene.gravity, implicit.stress
+    more = implicit.stress, implicit.sound_speed, *scene.gravity
     numbers, sums = ti.field(float, 1 << 20), ti.field(float, max(p.capacity, (1 << 20) // RUN))
     seconds = _median({
         "neighbour search": lambda: nb.build(p, w),
-        "physics: density, shear rate": lambda: sum_density(p, w, nb, fluid, *scratch),
-        "physics: forces": lambda: sum_acceleration(p, w, nb, fluid, *scratch, stress, *gravity),
+        "physics: density, shear rate": lambda: sum_density(
+            p, w, nb, fluid, *scratch, implicit.sound_speed
+        ),
+        "physics: forces": lambda: sum_acceleration(p, w, nb, fluid, *scratch, *more),
         "PcNet: features and network": lambda: net.estimate(p, w, nb, implicit),
         "PcNet: features, no hidden layer": lambda: shallow.estimate(p, w, nb, shallow.implicit),
-        "PcNet: forces": lambda: sum_acceleration(
-            p, w, nb, implicit.fluid, *scratch, stress, *gravity
-        ),
+        "PcNet: forces": lambda: sum_acceleration(p, w, nb, implicit.fluid, *scratch, *more),
         "PcNet: correction": lambda: correct_pressure(
             p, w, nb, implicit.fluid, implicit.interval, implicit.diagonal, implicit.pressure_term
         ),

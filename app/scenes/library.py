@@ -179,6 +179,16 @@ def _two_columns(title: str) -> Table:
     return table
 
 
+def _sound_speed(scene: Scene, derived: "Derived") -> str:
+    if derived.quiet_speed is None:
+        return f"{derived.sound_speed:.3g} m/s"
+    ratio = scene.discretization.sound_speed_ratio
+    return (
+        f"{ratio * derived.quiet_speed:.3g} m/s, or {ratio:g} times the largest "
+        f"speed; {derived.sound_speed:.3g} m/s while a wound is open"
+    )
+
+
 def info_tables(scene: Scene) -> list[Table]:
     """What a scene amounts to: the vessel's check, then the numbers that follow from it.
 
@@ -200,7 +210,7 @@ def info_tables(scene: Scene) -> list[Table]:
         ("support radius", f"{1e3 * derived.support_radius:.4g} mm"),
         ("across narrowest opening", f"{derived.particles_across_narrowest:.1f} particles"),
         ("expected speed", f"{derived.expected_speed:.3g} m/s"),
-        ("sound speed", f"{derived.sound_speed:.3g} m/s"),
+        ("sound speed", _sound_speed(scene, derived)),
         ("time step", f"{1e3 * derived.step:.3g} ms"),
         ("steps, about", f"{scene.duration / derived.step:.0f} for {scene.duration:g} s"),
         ("Reynolds number", f"{derived.reynolds_number:.3g}"),

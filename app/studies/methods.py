@@ -153,7 +153,16 @@ class Stretched:
         return self.model.used_fallback
 
     @property
-    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field] | None:
+    def sound_speed(self) -> float:
+        """As the model's."""
+        return self.model.sound_speed
+
+    @sound_speed.setter
+    def sound_speed(self, sound_speed: float) -> None:
+        self.model.sound_speed = sound_speed
+
+    @property
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float] | None:
         """As the model's."""
         return self.model.pair_coefficients
 
@@ -172,6 +181,7 @@ class Ballistic:
     def __init__(self, fluid: Fluid, capacity: int):
         """It keeps nothing but the liquid."""
         self.fluid = fluid
+        self.sound_speed = fluid.sound_speed
 
     def accelerate(
         self,
@@ -185,7 +195,7 @@ class Ballistic:
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """A fifth of the support radius at the largest speed, or at a hundredth of sound's [s]."""
-        slowest = 0.01 * self.fluid.sound_speed
+        slowest = 0.01 * self.sound_speed
         return 0.2 * self.fluid.kernel.support_radius / max(largest_speed, slowest)
 
 

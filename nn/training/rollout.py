@@ -110,7 +110,7 @@ class ReplaySimulation:
         blood, own = self.simulation.blood, self.physics
         sum_density(
             blood.particles, blood.wall, blood.neighbors, own.fluid, own.pressure_term,
-            own.viscosity,
+            own.viscosity, own.sound_speed,
         )  # fmt: skip
         return own.viscosity.to_numpy()[: blood.particles.count[None]]
 
@@ -126,7 +126,7 @@ class ReplaySimulation:
         inviscid = replace(self.fluid, rheology=Newtonian(0.0), nested=False)
         sum_acceleration(
             blood.particles, blood.wall, blood.neighbors, inviscid, self._zero, self._zero,
-            self.physics.stress, 0.0, 0.0, 0.0,
+            self.physics.stress, self.physics.sound_speed, 0.0, 0.0, 0.0,
         )  # fmt: skip
         other = blood.particles.acceleration.to_numpy()[:n]
         blood.particles.acceleration.from_numpy(previous)

@@ -16,7 +16,7 @@ blood at once, and then leaves the lists stale.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,22 @@ def finite_numbers(name: str, values: Any, shape: tuple[int, ...] = ()) -> np.nd
     return numbers
 
 
+@dataclass(frozen=True)
+class Datum:
+    """Pressure D(x) = value + gradient.x that others are measured from: see `PressureDatum`."""
+
+    value: float = 0.0
+    """At the origin [Pa]."""
+    gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[Pa/m]"""
+    share: float = 0.0
+    """Of gravity, that it balances."""
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """D(x) [Pa] at positions [m], (..., 3)."""
+        return np.asarray(self.value + x @ np.asarray(self.gradient))
+
+
 @dataclass(eq=False)
 class BloodFlow:
     """Blood, the wall about it and the lists between them, at a time: what boundaries act upon."""
@@ -64,6 +80,19 @@ class BloodFlow:
     """Body force per mass g [m/s^2]."""
     time: float = 0.0
     """Simulated time [s]."""
+    sound_speed: float = 0.0
+    """Present sound speed c [m/s]; 0 where the model's own stays."""
+    datum: Datum = field(default_factory=Datum)
+    """What pressure is measured from now."""
+    largest_speed: float = 0.0
+    """Of blood in the last step [m/s]."""
+
+    @property
+    def felt_gravity(self) -> tuple[float, float, float]:
+        """Gravity that the datum does not balance [m/s^2]."""
+        x, y, z = self.gravity
+        rest = 1.0 - self.datum.share
+        return rest * x, rest * y, rest * z
 
     def __post_init__(self) -> None:
         """Bring the wall into the order of the lists."""

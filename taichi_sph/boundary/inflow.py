@@ -6,7 +6,8 @@ the vessel as one body, at a speed u:
     u     = Q / A                   where a flow Q is given
     du/dt = mean_i(a_i) + p A / M   where a pressure p_0 is given
 
-with A the buffer's cross-section, M its mass, a_i what its neighbours in the vessel do to it, along
+measured from the datum (`taichi_sph.boundary.datum`) at the opening's centre, with A the buffer's
+cross-section, M its mass, a_i what its neighbours in the vessel do to it, along
 the inward normal and without gravity: forces within the buffer cancel.  p is the reservoir's p_0
 while blood leaves, and p_0 - rho u^2/2 while blood comes in: a reservoir at rest spends a part of
 its head on the speed of what it gives (Bernoulli), a jet into it gives none back.  With p_0 both
@@ -89,6 +90,16 @@ class BufferRegions:
                 buffer = k
         return buffer
 
+    def number_at(self, x: Floats) -> Integers:
+        """Number of the buffer that positions (n, 3) [m] are in; -1 if in none, (n,)."""
+        found = np.full(len(x), -1)
+        for k in range(self.count):
+            r = x - self.centre[k]
+            along = r @ self.normal[k]
+            aside2 = (r**2).sum(axis=1) - along**2
+            found[(along > 0.0) & (along < self.depth) & (aside2 < self.radius[k] ** 2)] = k
+        return found
+
     @ti.func
     def inward_normal(self, buffer):
         """Unit vector into the vessel."""
@@ -132,6 +143,15 @@ class DrivenOpening:
     def phase(self) -> Floats:
         """How far each strand is ahead of the first [spacings], in [0, 1), (n,)."""
         return np.asarray(GOLDEN * np.arange(len(self.sites)) % 1.0)
+
+    def factor_after(self, dt: float) -> float:
+        """Factor a step of dt [s] from now: the target is reached within RAMP_TIME."""
+        most = dt / RAMP_TIME
+        return self.factor + min(most, max(-most, self.target_factor - self.factor))
+
+    def pressure_at(self, time: float, dt: float) -> float:
+        """p_0 [Pa] at a time [s], dt [s] from now; 0 where a flow is given."""
+        return (self.pressure or 0.0) * self.factor_after(dt) * self.waveform(time)
 
     def reset(self) -> None:
         """Be as at the start, at rest."""
@@ -305,17 +325,18 @@ class BufferZones(Boundary):
         """Work out the speeds for a step of dt [s]; no proxy moves."""
         if not self.openings:
             return 0.0
-        time, gravity, control = self.blood.time, self.blood.gravity, self._control
+        time, control = self.blood.time + dt, self._control
+        gravity, datum = self.blood.felt_gravity, self.blood.datum
         for k, driven in enumerate(self.openings):
-            most = dt / RAMP_TIME
-            driven.factor += min(most, max(-most, driven.target_factor - driven.factor))
-            factor = driven.factor * driven.waveform(time + dt)
+            pressure = driven.pressure_at(time, dt) - float(datum.at(driven.opening.centre))
+            driven.factor = driven.factor_after(dt)
             area = driven.cross_section(self.spacing)
             if driven.flow is not None:
-                control[k] = 0.0, driven.flow * factor / area, 0.0, driven.speed
+                flow = driven.flow * driven.factor * driven.waveform(time)
+                control[k] = 0.0, flow / area, 0.0, driven.speed
             elif driven.pressure is not None:
                 # p A/M, times the number of particles that M is of.
-                head = driven.pressure * factor - 0.5 * self.density * max(0.0, driven.speed) ** 2
+                head = pressure - 0.5 * self.density * max(0.0, driven.speed) ** 2
                 push = head * driven.pressure_area(self.spacing) / (self.density * self.spacing**3)
                 control[k] = 1.0, push, float(-np.dot(gravity, driven.opening.normal)), driven.speed
         drive_buffers(self.blood.particles, self, control, dt)

@@ -89,8 +89,9 @@ class Tool(Boundary):
         blood = self.blood
         if blood.wall.tool and model.pair_coefficients is not None:
             force = force_on_tool(
-                blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients
-            )
+                blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients,
+                blood.datum.value, *blood.datum.gradient,
+            )  # fmt: skip
             self._impulse += dt * np.array([force[0], force[1], force[2]])
             self._impulse_time += dt
         self.last_displacement = 0.0
@@ -163,7 +164,10 @@ class Tool(Boundary):
         """Sum the force on the tool, for nothing."""
         blood = self.blood
         if blood.wall.tool and model.pair_coefficients is not None:
-            force_on_tool(blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients)
+            force_on_tool(
+                blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients,
+                blood.datum.value, *blood.datum.gradient,
+            )  # fmt: skip
 
     def reset(self) -> None:
         """At home and at rest."""

@@ -19,7 +19,7 @@ class Tait:
     rest_density: float
     """rho_0 [kg/m^3]."""
     sound_speed: float
-    """c [m/s]."""
+    """c at the start [m/s]."""
     background_pressure: float = 0.0
     """Pressure at rest density [Pa]."""
 
@@ -28,19 +28,20 @@ class Tait:
 
     @property
     def stiffness(self) -> float:
-        """Stiffness rho_0 c^2/gamma [Pa]."""
+        """Stiffness rho_0 c^2/gamma at the start [Pa]."""
         return self.rest_density * self.sound_speed**2 / self.exponent
 
     @ti.func
-    def pressure(self, density):
-        """Pressure p [Pa]."""
+    def pressure(self, density, sound_speed):
+        """Pressure p [Pa] at the present sound speed [m/s]."""
         ratio = density * ti.static(1.0 / self.rest_density)
+        stiffness = ti.static(self.rest_density / self.exponent) * sound_speed * sound_speed
         return ti.max(
             0.0,
-            self.stiffness * (ratio ** ti.static(self.exponent) - 1.0) + self.background_pressure,
+            stiffness * (ratio ** ti.static(self.exponent) - 1.0) + self.background_pressure,
         )
 
     def pressure_of(self, density: np.ndarray) -> np.ndarray:
-        """Pressure p [Pa] for numpy, double precision, shape of `density`."""
+        """Pressure p [Pa] at the start's sound speed, double precision, shape of `density`."""
         power = (np.asarray(density, dtype=float) / self.rest_density) ** self.exponent
         return np.maximum(0.0, self.stiffness * (power - 1.0) + self.background_pressure)

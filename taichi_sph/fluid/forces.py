@@ -34,13 +34,13 @@ def pair_pressure(fluid: ti.template(), pressure_term_i, pressure_term_j):
 
 
 @ti.func
-def artificial_factor(fluid: ti.template(), density):
+def artificial_factor(fluid: ti.template(), sound_speed, density):
     """Factor alpha h_s c of the artificial viscosity where blood has a density [m^2/s].
 
     Thin blood, as `taichi_sph.fluid.shifting` has it, has its own alpha beside the scene's: nothing
     else keeps its particles from clumping, for they have no pressure.
     """
-    scale = ti.static(fluid.kernel.smoothing_length * fluid.sound_speed)
+    scale = ti.static(fluid.kernel.smoothing_length) * sound_speed
     ratio = density * ti.static(1.0 / fluid.rest_density)
     thin = ti.static(fluid.thin_viscosity) * (1.0 - surrounded(ratio))
     return scale * (ti.static(fluid.artificial_viscosity) + thin)
@@ -87,7 +87,9 @@ def pair_nested_stress(fluid: ti.template(), stress_sum, r_ij, slope, rho_i, rho
 
 
 @ti.func
-def wall_pair_acceleration(w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, fluid: ti.template()):
+def wall_pair_acceleration(
+    w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, fluid: ti.template(), sound_speed
+):
     """Acceleration by a proxy over rho_0, a_ik/rho_0 (Eqs. 15 and 16) [m^4/(kg s^2)].
 
     a_ik = -gamma rho_0 V_k (p_i/rho_i^2 + Pi_ik) grad W_ik
@@ -103,7 +105,7 @@ def wall_pair_acceleration(w: ti.template(), k, r_ik, v_i, rho_i, p_i, mu_i, flu
     pressure = pair_pressure(fluid, p_i, 0.0)
     if ti.static(fluid.has_artificial_viscosity):
         # One quotient for two: rho_i + rho_k = 2 rho_i.
-        alpha = artificial_factor(fluid, rho_i)
+        alpha = artificial_factor(fluid, sound_speed, rho_i)
         pressure += pair_artificial_viscosity(alpha, r_ik, v_ik, softened * rho_i, 2.0)
     # The quotient by rho_i rho_k does not depend on k and leaves the loop.
     friction = ti.static(2.0 * fluid.calibration.wall_friction) * mu_i / (rho_i * rho_i)

@@ -106,14 +106,15 @@ class ImplicitAcceleration:
         Args:
             fluid: constants of the sums; the viscous stress is pairwise here.
             capacity: rows of the particles.
-            interval: step T [s].
+            interval: step T at the start [s]; it goes with 1/c.
             iterations: Jacobi iterations after the initial pressure.
             initial_pressure: what estimates the pressure first.
             name: for summaries.
         """
         self.name = name
         self.fluid = replace(fluid, nested=False)
-        self.interval = interval
+        self.sound_speed = fluid.sound_speed
+        self._interval_at_start = interval
         self.iterations = iterations
         self.initial_pressure = initial_pressure
         self.pressure_term = ti.field(float, capacity)
@@ -126,9 +127,14 @@ class ImplicitAcceleration:
         """Stress of the nested form, which is not in use; kernels want a field."""
 
     @property
-    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field]:
-        """Constants, p/rho^2 and mu."""
-        return self.fluid, self.pressure_term, self.viscosity
+    def interval(self) -> float:
+        """Present step T [s]."""
+        return self._interval_at_start * (self.fluid.sound_speed / self.sound_speed)
+
+    @property
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float]:
+        """Constants, p/rho^2, mu and c."""
+        return self.fluid, self.pressure_term, self.viscosity, self.sound_speed
 
     def accelerate(
         self,
@@ -141,7 +147,9 @@ class ImplicitAcceleration:
         sums = particles, wall, neighbors, self.fluid
         self.initial_pressure(particles, wall, neighbors, self)
         for remaining in range(self.iterations, -1, -1):
-            sum_acceleration(*sums, self.pressure_term, self.viscosity, self.stress, *gravity)
+            sum_acceleration(
+                *sums, self.pressure_term, self.viscosity, self.stress, self.sound_speed, *gravity
+            )
             if remaining:
                 correct_pressure(*sums, self.interval, self.diagonal, self.pressure_term)
 

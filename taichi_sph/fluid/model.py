@@ -20,6 +20,8 @@ class AccelerationModel(Protocol):
 
     name: str
     """Short name for summaries."""
+    sound_speed: float
+    """Present sound speed c [m/s]; a simulation sets it before a step."""
 
     @property
     def used_fallback(self) -> bool:
@@ -27,8 +29,11 @@ class AccelerationModel(Protocol):
         ...
 
     @property
-    def pair_coefficients(self) -> "tuple[Fluid, ti.Field, ti.Field] | None":
-        """What the last forces were summed from: constants, p/rho^2 and mu; None if from none."""
+    def pair_coefficients(self) -> "tuple[Fluid, ti.Field, ti.Field, float] | None":
+        """What the last forces were summed from: constants, p/rho^2, mu and c; None if from none.
+
+        p is measured from the datum, see `taichi_sph.boundary.datum`.
+        """
         ...
 
     def accelerate(
@@ -82,7 +87,7 @@ class Fluid:
 
     @property
     def sound_speed(self) -> float:
-        """Sound speed c at rest density [m/s]."""
+        """Sound speed c at rest density at the start [m/s]."""
         return self.equation_of_state.sound_speed
 
     @property
@@ -100,21 +105,11 @@ class Fluid:
         """Whether any blood has it."""
         return self.artificial_viscosity > 0.0 or self.thin_viscosity > 0.0
 
-    @property
-    def sound_damping_factor(self) -> float:
-        """Factor zeta h_s c of the damping of sound [m^2/s]."""
-        return self.sound_damping * self.kernel.smoothing_length * self.sound_speed
-
-    @property
-    def sound_frequency(self) -> float:
-        """Fewest steps that sound asks for, c/(C h_s) [1/s]."""
-        return self.sound_speed / (self.courant_number * self.kernel.smoothing_length)
-
-    def step_limits(self, speed: float, acceleration: float) -> "StepLimits":
-        """Limits of an explicit step at a largest speed [m/s] and acceleration [m/s^2]."""
+    def step_limits(self, sound_speed: float, speed: float, acceleration: float) -> "StepLimits":
+        """Limits of an explicit step at c, a largest speed [m/s] and acceleration [m/s^2]."""
         return stable_step_limits(
             self.kernel.smoothing_length, self.rest_density, self.rheology.largest_viscosity,
-            self.sound_speed, self.courant_number, speed, acceleration,
+            sound_speed, self.courant_number, speed, acceleration,
         )  # fmt: skip
 
 

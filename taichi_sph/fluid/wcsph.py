@@ -42,6 +42,7 @@ class SphAcceleration:
     def __init__(self, fluid: Fluid, capacity: int):
         """Make the scratch fields for `capacity` particles."""
         self.fluid = fluid
+        self.sound_speed = fluid.sound_speed
         self.pressure_term = ti.field(float, capacity)
         """p / rho^2 [m^5/(kg s^2)]."""
         self.viscosity = ti.field(float, capacity)
@@ -50,9 +51,9 @@ class SphAcceleration:
         """tau [Pa], in the nested form only."""
 
     @property
-    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field]:
-        """Constants, p/rho^2 and mu."""
-        return self.fluid, self.pressure_term, self.viscosity
+    def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float]:
+        """Constants, p/rho^2, mu and c."""
+        return self.fluid, self.pressure_term, self.viscosity, self.sound_speed
 
     def accelerate(
         self,
@@ -63,14 +64,18 @@ class SphAcceleration:
     ) -> None:
         """Density, pressure and viscosity of each particle, then its acceleration."""
         sums = particles, wall, neighbors, self.fluid
-        sum_density(*sums, self.pressure_term, self.viscosity)
+        sum_density(*sums, self.pressure_term, self.viscosity, self.sound_speed)
         if self.fluid.nested:
             sum_stress(*sums, self.viscosity, self.stress)
-        sum_acceleration(*sums, self.pressure_term, self.viscosity, self.stress, *gravity)
+        sum_acceleration(
+            *sums, self.pressure_term, self.viscosity, self.stress, self.sound_speed, *gravity
+        )
 
     def stable_step(self, largest_speed: float, largest_acceleration: float) -> float:
         """Smallest of the sound, viscous and force limits [s]."""
-        return self.fluid.step_limits(largest_speed, largest_acceleration).smallest
+        return self.fluid.step_limits(
+            self.sound_speed, largest_speed, largest_acceleration
+        ).smallest
 
 
 @ti.kernel
@@ -81,6 +86,7 @@ def sum_density(
     fluid: ti.template(),
     pressure_term: ti.template(),
     viscosity: ti.template(),
+    sound_speed: float,
 ):
     """Density (Eq. 2), q_i (Eq. 14), the viscosity of the shear rate (Eq. 8) and the shifting.
 
@@ -90,22 +96,23 @@ def sum_density(
     | L_i | gradient | velocity gradient, see `taichi_sph.fluid.density` | 1/s |
     | q_i | pressure_term | of the equation of state and the damping of sound | m^5/(kg s^2) |
     | mu_i | viscosity | of the shear rate sqrt(2 D:D) | Pa s |
+    | c/(C h_s) | frequency | fewest steps that sound asks for | 1/s |
 
     The nested form has its own viscosity, see `sum_stress`.
     Reads: position, velocity.  Writes: density, shifting, pressure_term, viscosity.
     """
+    h_s = ti.static(fluid.kernel.smoothing_length)
+    frequency = sound_speed * ti.static(1.0 / (fluid.courant_number * h_s))
     for i in range(p.count[None]):
         rho, density_rises, _, gradient, concentration = density_sums(i, p, w, nb, fluid, 1.0)
         rate = shear_rate(gradient)
         p.density[i] = rho
-        damping = ti.static(fluid.sound_damping_factor) * density_rises
-        pressure = fluid.equation_of_state.pressure(rho) / rho + damping
+        damping = ti.static(fluid.sound_damping * h_s) * sound_speed * density_rises
+        pressure = fluid.equation_of_state.pressure(rho, sound_speed) / rho + damping
         pressure_term[i] = ti.max(0.0, pressure) / rho
         viscosity[i] = fluid.rheology.viscosity(rate)
         ratio = rho * ti.static(1.0 / fluid.rest_density)
-        p.shifting[i] = shifting_velocity(
-            fluid, ratio, rate, concentration, ti.static(fluid.sound_frequency)
-        )
+        p.shifting[i] = shifting_velocity(fluid, ratio, rate, concentration, frequency)
 
 
 @ti.kernel
@@ -156,6 +163,7 @@ def sum_acceleration(
     pressure_term: ti.template(),
     viscosity: ti.template(),
     stress: ti.template(),
+    sound_speed: float,
     g_x: float,
     g_y: float,
     g_z: float,
@@ -198,7 +206,7 @@ def sum_acceleration(
             rho_j = p.density[j]
             pressure = pair_pressure(fluid, p_i, pressure_term[j])
             if ti.static(fluid.has_artificial_viscosity):
-                alpha = artificial_factor(fluid, 0.5 * (rho_i + rho_j))
+                alpha = artificial_factor(fluid, sound_speed, 0.5 * (rho_i + rho_j))
                 pressure += pair_artificial_viscosity(alpha, r_ij, v_ij, softened, rho_i + rho_j)
             a_i -= (pressure * slope) * r_ij
             if ti.static(fluid.nested):
@@ -212,7 +220,7 @@ def sum_acceleration(
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
-            a_wall += wall_pair_acceleration(w, k, r_ik, v_i, rho_i, p_i, mu_i, fluid)
+            a_wall += wall_pair_acceleration(w, k, r_ik, v_i, rho_i, p_i, mu_i, fluid, sound_speed)
         a_wall *= ti.static(fluid.rest_density)
         # A vector as an argument would cost 0.05 ms a launch.
         p.acceleration[i] = a_i + a_wall + ti.Vector([g_x, g_y, g_z])
@@ -226,18 +234,28 @@ def force_on_tool(
     fluid: ti.template(),
     pressure_term: ti.template(),
     viscosity: ti.template(),
+    sound_speed: float,
+    datum: float,
+    datum_x: float,
+    datum_y: float,
+    datum_z: float,
 ) -> ti.math.vec3:
     """Force F = -m sum_i sum_k a_ik over the proxies of the tool [N], as in `sum_acceleration`.
 
-    m is the blood that a particle stands for.  Reads: position, velocity, density, scratch.
+    m is the blood that a particle stands for.  The tool feels the whole pressure, the datum too:
+    its value at the origin [Pa] and its gradient [Pa/m].
+    Reads: position, velocity, density, scratch.
     """
     force = ti.Vector([0.0, 0.0, 0.0])
+    slope = ti.Vector([datum_x, datum_y, datum_z])
     for i in range(p.count[None]):
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             if k >= w.count:
                 r_ik = nb.grid.separation(p.position[i], w.position[k])
+                rho = p.density[i]
+                whole = pressure_term[i] + (datum + slope.dot(p.position[i])) / (rho * rho)
                 force -= wall_pair_acceleration(
-                    w, k, r_ik, p.velocity[i], p.density[i], pressure_term[i], viscosity[i], fluid
+                    w, k, r_ik, p.velocity[i], rho, whole, viscosity[i], fluid, sound_speed
                 )
     return ti.static(p.mass * fluid.rest_density) * force

@@ -159,15 +159,16 @@ def cache_key(vertices: Floats, faces: Integers, *numbers: float) -> str:
     return text.hexdigest()[:40]
 
 
-def _cache_file(key: str) -> Path:
+def cache_file(kind: str, key: str) -> Path:
+    """Where a kind of thing is kept that is computed once, by the hash of what it follows from."""
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(base) / "vesselflow" / f"wall-{key}.npz"
+    return Path(base) / "vesselflow" / f"{kind}-{key}.npz"
 
 
 def load_cached(key: str) -> WallSample | None:
     """The points stored under a key; None where there are none or the file is damaged."""
     try:
-        with _cache_file(key).open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with cache_file("wall", key).open("rb") as file, np.load(file, allow_pickle=False) as data:
             positions, normals = data["positions"], data["normals"]
             mean, spread, least, gap, dropped, narrow, x, y, z = map(float, data["figures"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
@@ -192,7 +193,7 @@ def store_cached(key: str, sample: WallSample) -> None:
         sample.narrowest_gap,
         *sample.gap_place,
     )
-    path = _cache_file(key)
+    path = cache_file("wall", key)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as file:

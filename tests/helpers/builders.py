@@ -104,6 +104,7 @@ class Prescribed:
     name: str = "prescribed"
     used_fallback: bool = False
     pair_coefficients: None = None
+    sound_speed: float = 1.0
 
     def accelerate(self, particles, wall, neighbors, gravity) -> None:
         """Write the law's acceleration and the rest density."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -11,11 +12,11 @@ import pytest
 from app.studies.methods import Ballistic, Stretched
 from builders import CAPACITY, SPHERE, D, R, Setup, ball, float_dtype, make_fluid, precision, sphere
 from clouds import SCALES
-from nn.features import NAMES, NETWORK_COUNT, PAPER_COUNT
+from nn.features import NAMES, NETWORK_COUNT, PAPER_COUNT, FeatureScales
 from nn.pcnet import make_pcnet
 from nn.weights import Training, Weights
 from taichi_sph.fluid.implicit import ImplicitAcceleration
-from taichi_sph.fluid.model import AccelerationModel
+from taichi_sph.fluid.model import AccelerationModel, Fluid
 from taichi_sph.fluid.rheology import Casson
 from taichi_sph.fluid.wcsph import SphAcceleration, sum_acceleration
 
@@ -27,7 +28,6 @@ TRAIN = np.array((0.4, -0.3, 0.2))
 """Velocity of a moving frame [m/s]: below what a network refuses as too fast."""
 GRAVITY = (1.0, -2.0, -9.81)
 FLUID = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), damping=1.0)
-NESTED = make_fluid(rheology=Casson(3.5e-3, 5e-3, 7.0), nested=True, damping=1.0)
 BINNED = ("alpha_dis_b", "alpha_rv_b", "beta_dis_b", "beta_rv_b", "alpha_dis_p", "beta_dis_p")
 """Features that jump where a value changes its bin; rounding may do that."""
 
@@ -57,17 +57,19 @@ def network(head: str) -> Weights:
 @cache
 def model_named(name: str) -> AccelerationModel:
     """One of each: its fields are compiled into its kernels."""
-    return MODELS[name]()
+    return MODELS[name](FLUID, SCALES)
 
 
-MODELS: dict[str, Callable[[], AccelerationModel]] = {
-    "physics": lambda: SphAcceleration(FLUID, CAPACITY),
-    "nested physics": lambda: SphAcceleration(NESTED, CAPACITY),
-    "implicit": lambda: ImplicitAcceleration(FLUID, CAPACITY, SCALES.frame_interval),
-    "direct head": lambda: make_pcnet(network("direct"), FLUID, SCALES, CAPACITY, guarded=False),
-    "pressure head": lambda: make_pcnet(network("pressure"), FLUID, SCALES, CAPACITY),
-    "stretched": lambda: Stretched(model_named("physics"), 1.5),
-    "ballistic": lambda: Ballistic(FLUID, CAPACITY),
+MODELS: dict[str, Callable[[Fluid, FeatureScales], AccelerationModel]] = {
+    "physics": lambda fluid, _: SphAcceleration(fluid, CAPACITY),
+    "nested physics": lambda fluid, _: SphAcceleration(replace(fluid, nested=True), CAPACITY),
+    "implicit": lambda fluid, s: ImplicitAcceleration(fluid, CAPACITY, s.frame_interval),
+    "direct head": lambda fluid, s: make_pcnet(
+        network("direct"), fluid, s, CAPACITY, guarded=False
+    ),
+    "pressure head": lambda fluid, s: make_pcnet(network("pressure"), fluid, s, CAPACITY),
+    "stretched": lambda fluid, _: Stretched(SphAcceleration(fluid, CAPACITY), 1.5),
+    "ballistic": lambda fluid, _: Ballistic(fluid, CAPACITY),
 }
 
 
@@ -127,7 +129,9 @@ def test_every_model_shifts_particles_alike_but_for_its_step(name):
     stage, model = sphere(), model_named(name)
     put(stage, *blood(SPHERE - 0.2 * D))
     accelerations(stage, model)
-    frequency = FLUID.sound_frequency if "physics" in name else 1.0 / SCALES.frame_interval
+    frequency = 1.0 / SCALES.frame_interval
+    if "physics" in name:
+        frequency = 1.0 / FLUID.step_limits(FLUID.sound_speed, 0.0, 0.0).sound
     expected = stage.reference(FLUID).shifting(FLUID.shifting, frequency)
     found = stage.in_order(stage.particles.shifting)
     assert_close(found, expected, {"f64": 1e-10, "f32": 2e-3}[precision()])
@@ -175,11 +179,35 @@ def test_a_model_says_what_it_is_and_what_its_forces_were_summed_from(model):
     assert model.name and not model.used_fallback
     if model.pair_coefficients is None:
         return
-    fluid, pressure_term, viscosity = model.pair_coefficients
+    fluid, pressure_term, viscosity, sound_speed = model.pair_coefficients
+    assert sound_speed == model.sound_speed == FLUID.sound_speed
     if not fluid.nested:  # whose stress is in a field of its own
         physics = SphAcceleration(fluid, 1)
         sum_acceleration(
             stage.particles, stage.wall, stage.neighbors, fluid, pressure_term, viscosity,
-            physics.stress, *GRAVITY,
+            physics.stress, sound_speed, *GRAVITY,
         )  # fmt: skip
         np.testing.assert_array_equal(stage.in_order(stage.particles.acceleration), found)
+
+
+@pytest.mark.parametrize("name", [*MODELS])
+def test_a_model_at_another_sound_speed_is_the_one_that_is_made_for_it(name):
+    stage, factor = sphere(), 1.7
+    law = replace(FLUID.equation_of_state, sound_speed=factor * FLUID.sound_speed)
+    fluid = replace(FLUID, equation_of_state=law)
+    interval = SCALES.frame_interval / factor
+    scales = replace(SCALES, frame_interval=interval, sound_speed=factor * SCALES.sound_speed)
+    made, moved = MODELS[name](fluid, scales), MODELS[name](FLUID, SCALES)
+    moved.sound_speed = fluid.sound_speed
+    found = []
+    for model in (made, moved):
+        put(stage, *blood(SPHERE - 0.2 * D))
+        found.append((accelerations(stage, model), stage.in_order(stage.particles.shifting)))
+        assert model.stable_step(0.1, 1.0) == pytest.approx(made.stable_step(0.1, 1.0))
+    for expected, other in zip(*found, strict=True):
+        limit = {"f64": 1e-10, "f32": 2e-3}[precision()] * np.abs(expected).max()
+        np.testing.assert_allclose(other, expected, rtol=0, atol=limit)
+    put(stage, *blood(SPHERE - 0.2 * D))
+    if name != "ballistic":
+        before = accelerations(stage, model_named(name))
+        assert np.abs(found[0][0] - before).max() > 1e-3 * np.abs(before).max()

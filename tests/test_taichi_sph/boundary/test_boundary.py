@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from bleeding_tube import HOLE, LENGTH, SIDE, D, assert_account_is_whole, assert_same, wall_of
+from bleeding_tube import (
+    HOLE,
+    LENGTH,
+    OF_ONE,
+    SIDE,
+    D,
+    assert_account_is_whole,
+    assert_same,
+    wall_of,
+)
 from states import through_a_file
 from taichi_sph.boundary.outlets import DROPLET_TIME, SUCTION
 from taichi_sph.boundary.wounds import LEAST_RADIUS
@@ -28,15 +37,15 @@ def test_a_session_goes_on_bitwise_with_wounds_suction_a_moving_tool_and_a_tilt(
     sim.gravity = (1.0, 2.0, -9.0)
     sim.inflow.set_factor(0.7)
     sim.tool.move_to(np.array([1e-3, -1e-3, 0.0]), np.array([0.8, 0.0, 0.6, 0.0]))
-    sim.advance_to(0.026)
+    sim.advance_to(0.036)
     sim.wounds.close(0)
-    sim.advance_to(0.03)
+    sim.advance_to(0.04)
     kept = sim.save_state()
     removed = kept.boundaries["outlets"]["removed"]
     tool = sim.tool
     assert tool.velocity.any()
     assert tool.spin.any()
-    sim.advance_to(0.036)
+    sim.advance_to(0.046)
     expected, told = state_of(sim)
     at = tool.position.copy()
     assert int(sim.outlets.outflow_counts()[SUCTION]) > int(removed[SUCTION]) > 0
@@ -47,9 +56,9 @@ def test_a_session_goes_on_bitwise_with_wounds_suction_a_moving_tool_and_a_tilt(
     sim.tool.move_to(np.array([0.0, 2e-3, 0.0]))
     sim.advance_to(sim.time + 0.002)
     sim.load_state(through_a_file(kept, tmp_path))
-    assert sim.time == 0.03
+    assert sim.time == 0.04
     assert [w.is_open for w in sim.wounds] == [False, True]
-    sim.advance_to(0.036)
+    sim.advance_to(0.046)
     found, tells = state_of(sim)
     assert_same(found, expected)
     assert tells == told
@@ -128,12 +137,12 @@ def test_the_force_on_a_tool_is_a_mean_since_it_was_last_asked(sim):
 def test_no_blood_begins_in_the_tool(sim):
     x = sim.positions()
     away = np.linalg.norm(x - [0.0, 0.0, -5e-3], axis=1)
-    assert away.min() > 2e-3 + 0.45 * D
-    # And all that is clear of it is there.
-    lattice = sim.vessel.fill_column(sim.scene.column, D)
-    clear = np.linalg.norm(lattice - [0.0, 0.0, -5e-3], axis=1) > 2e-3 + 0.5 * D
+    # Settled blood keeps half a spacing from a plane, less from a ball of 1.7 spacings.
+    assert away.min() > 2e-3 + 0.2 * D
+    # And the rest is full, but for what curved walls leave no room for.
+    room = sim.vessel.volume - 4.0 / 3.0 * np.pi * 2e-3**3
     inside = np.abs(x[:, 2]) < 0.5 * LENGTH
-    assert inside.sum() == clear.sum()
+    assert 0.95 * room < inside.sum() * OF_ONE < 1.01 * room
 
 
 def test_a_state_that_is_refused_changes_nothing(sim):

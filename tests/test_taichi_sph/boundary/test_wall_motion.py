@@ -234,7 +234,7 @@ def test_between_two_builds_no_proxy_comes_near_unseen(sim, monkeypatch):
     assert sim.wall.displacement_factor == pytest.approx(1.0)
     before, compared = sim.neighbors.builds, 0
     while sim.wall.displacement_factor > 0.1:
-        sim.step(5e-5)
+        sim.step(2e-5)
         if not sim.neighbors.stale:
             pairs, lacking = missed(sim, sim.neighbors.support_radius)
             assert lacking == 0

@@ -19,7 +19,7 @@ SLOPE = {"f64": 1e-7, "f32": 1e-3}
 @ti.kernel
 def evaluate(state: ti.template(), density: ti.types.ndarray(), pressure: ti.types.ndarray()):
     for k in range(density.shape[0]):
-        pressure[k] = state.pressure(density[k])
+        pressure[k] = state.pressure(density[k], ti.static(state.sound_speed))
 
 
 def pressures(state: Tait, densities) -> np.ndarray:
