@@ -55,7 +55,14 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
         head = g * float(along.max() - along.min())
     pressures = [(0.0, 0.0), *_reservoir_pressures(scene)]
     span = max(high for _, high in pressures) - min(low for low, _ in pressures)
-    return _fastest(scene, vessel, math.sqrt(2.0 * (head + span / scene.blood.density)))
+    jet = math.sqrt(2.0 * (head + span / scene.blood.density))
+    flow, squeezed = _largest_flow(scene), _squeezed(scene, vessel)
+    if flow > 0.0:
+        jet = max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
+    if squeezed > 0.0:
+        area = sum(opening.area for opening in vessel.openings if opening.is_open)
+        jet += 2.0 * squeezed / area if area else squeezed / vessel.wall_area
+    return jet
 
 
 def is_closed(scene: Scene) -> bool:
@@ -74,14 +81,17 @@ def is_closed(scene: Scene) -> bool:
 def quiet_speed(scene: Scene, vessel: Vessel) -> float:
     """Largest speed that the drive of a closed scene gives blood while nothing is wounded [m/s].
 
-    As `expected_speed`, without gravity, with the reservoirs' pressures among themselves, and each
-    of them with its part of what pumps drive.
+    Of the reservoirs' difference of pressures, sqrt(2 p/rho), or of a parabolic profile in their
+    openings of all that flows, 2 Q/A, whichever is more.
     """
     pressures = list(_reservoir_pressures(scene))
     span = max(high for _, high in pressures) - min(low for low, _ in pressures)
-    jet = math.sqrt(2.0 * span / scene.blood.density)
+    tables = scene.openings
+    ends = [o for o in vessel.openings if o.name in tables and tables[o.name].pressure is not None]
+    area = sum(opening.area for opening in ends)
+    through = 2.0 * (_largest_flow(scene) + _squeezed(scene, vessel)) / area
     # Where only a wound lets blood flow: as fast as out of it.
-    return _fastest(scene, vessel, jet, 1.0 / len(pressures)) or math.inf
+    return max(math.sqrt(2.0 * span / scene.blood.density), through) or math.inf
 
 
 def _reservoir_pressures(scene: Scene) -> Iterator[tuple[float, float]]:
@@ -92,22 +102,20 @@ def _reservoir_pressures(scene: Scene) -> Iterator[tuple[float, float]]:
             yield float(pressure.min()), float(pressure.max())
 
 
-def _fastest(scene: Scene, vessel: Vessel, jet: float, part: float = 1.0) -> float:
-    """Largest speed beside a jet's [m/s]: of a part of what pumps drive, and a wall that pulses."""
+def _largest_flow(scene: Scene) -> float:
+    """Sum of what pumps drive at their peaks [m^3/s]."""
     flow = 0.0
     for table in scene.openings.values():
         if table.flow is not None:
             wave = read_waveform(table.waveform, Path(scene.folder)).factor
             flow += float(np.abs(wave * table.flow).max())
-    squeezed = 0.0
+    return flow
+
+
+def _squeezed(scene: Scene, vessel: Vessel) -> float:
+    """What a wall that pulses drives out at its fastest [m^3/s]."""
     motion = read_wall_motion(scene, vessel)
-    if motion is not None:
-        area = sum(opening.area for opening in vessel.openings if opening.is_open)
-        speed = motion.amplitude * motion.peak_rate
-        squeezed = 2.0 * vessel.wall_area * speed / area if area else speed
-    if flow > 0.0:
-        jet = max(jet, 2.0 * part * flow / (0.25 * math.pi * vessel.narrowest**2))
-    return jet + squeezed
+    return 0.0 if motion is None else vessel.wall_area * motion.amplitude * motion.peak_rate
 
 
 def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> Derived:

@@ -71,14 +71,8 @@ def run_here(folder: Path, monkeypatch: pytest.MonkeyPatch, *command: str) -> Pa
     return next(folder.glob("*.checkpoint.npz"))
 
 
-@pytest.mark.parametrize(
-    "model",
-    [
-        "physics",
-        pytest.param("pcnet", marks=pytest.mark.validation),
-        pytest.param("implicit", marks=pytest.mark.validation),
-    ],
-)
+@pytest.mark.validation
+@pytest.mark.parametrize("model", ["physics", "pcnet", "implicit"])
 def test_a_resumed_run_ends_bitwise_like_one_that_was_not_interrupted(
     box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:

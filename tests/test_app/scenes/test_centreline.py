@@ -62,6 +62,7 @@ def test_openings_lie_where_the_table_says_and_are_flat(name: str) -> None:
         assert np.ptp(height) < 1e-4 * radius
 
 
+@pytest.mark.validation
 def test_remaking_the_aorta_gives_the_committed_surface(tmp_path: Path) -> None:
     (tmp_path / "centreline.json").write_bytes(
         (VESSELS / "aortoiliac" / "centreline.json").read_bytes()

@@ -15,8 +15,8 @@ PAPER = {"A": 56_000, "B": 73_000}
 """Proxies of the paper's scenes."""
 
 
-FAST = ("carotid_surgery",)
-"""A driven one; the others are started with the slow proofs."""
+FAST = ("box",)
+"""The others are started with the slow proofs."""
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def packed(tube: Simulation) -> tuple[list[tuple[float, float, float]], object]:
     drive(tube, "top", pressure=100.0)
     drive(tube, "bottom", pressure=100.0)
     history = []
-    for frame in range(1, 126):
+    for frame in range(1, 76):
         tube.advance_to(0.002 * frame)
         pressure = tube.pressures()[np.abs(tube.positions()[:, 2]) < 0.3 * LENGTH].mean()
         history.append((*(p.speed for p in tube.inflow.openings), pressure))
@@ -43,7 +43,7 @@ def test_blood_between_reservoirs_of_one_pressure_comes_to_rest_under_it(driven,
     jet = math.sqrt(2.0 * 100.0 / DENSITY)
     # At no time does it flow or ring: its level is a datum, and it has settled.
     assert np.abs(speeds).max() < 0.1 * jet
-    risen = np.minimum(1.0, 0.002 * np.arange(1, 126) / RAMP_TIME)
+    risen = np.minimum(1.0, 0.002 * np.arange(1, 76) / RAMP_TIME)
     assert np.abs(pressure - 100.0 * risen).max() < 30.0
     # What drifts on is what a few per cent of the pressure would drive (Poiseuille).
     length = driven.particles.count[None] * OF_ONE / area(driven)

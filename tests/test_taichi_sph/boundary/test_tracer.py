@@ -111,6 +111,7 @@ def test_blood_is_as_old_as_it_has_been_in_the_vessel(driven):
     assert added and not any(age[i] for i in {*added, *beyond.tolist()}), "not yet come in"
 
 
+@pytest.mark.validation
 def test_the_mean_age_of_what_leaves_a_steady_flow_is_its_volume_over_the_flow(driven):
     # Danckwerts 1953.  The tube is emptied three times before, and twice meanwhile: the first blood
     # that comes in is 2 % older, for the flow is not steady yet.
