@@ -8,7 +8,8 @@ SCENE ?= aortoiliac
 OPTIONS ?=
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# What is imported is compiled then; to compile all of torch takes a minute.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 INSTALLED := .venv/.installed
 DEVELOPS := .venv/.installed-dev
 
@@ -20,7 +21,7 @@ run: $(INSTALLED)
 	$(BIN)/vesselflow run $(SCENE) --rrd recordings/$(notdir $(basename $(SCENE))).rrd $(OPTIONS)
 
 test: lint
-	$(BIN)/pytest --numprocesses 2 --dist loadfile --durations=25
+	$(BIN)/pytest --numprocesses 2 --dist loadgroup --durations=25
 
 validation: $(DEVELOPS)
 	$(BIN)/pytest -m validation --durations=25

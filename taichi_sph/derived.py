@@ -31,9 +31,9 @@ class Derived:
     quiet_speed: float | None
     """Of a closed scene, see the function of that name [m/s]; else None."""
     step: float
-    """Time step at the expected speed [s], before force limits."""
+    """Time step of the physics at the expected speed, or the quiet one [s], before force limits."""
     reynolds_number: float
-    """rho U D / eta at the expected speed and the narrowest opening's diameter."""
+    """rho U D / eta at that speed and the narrowest opening's diameter."""
     particles_across_narrowest: float
     """Diameter of the narrowest opening over the spacing."""
 
@@ -125,9 +125,12 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
     speed = expected_speed(scene, vessel)
     # Without gravity nothing drives the blood but itself: 1 m/s, an arterial speed, then.
     sound = grid.sound_speed_ratio * (speed or 1.0)
+    quiet = min(quiet_speed(scene, vessel), speed or 1.0) if is_closed(scene) else None
+    usual = speed if quiet is None else quiet
     limits = stable_step_limits(
         WendlandC2(radius).smoothing_length, scene.blood.density,
-        make_rheology(scene.blood.rheology).largest_viscosity, sound, grid.courant_number, speed,
+        make_rheology(scene.blood.rheology).largest_viscosity,
+        grid.sound_speed_ratio * (usual or 1.0), grid.courant_number, usual,
     )  # fmt: skip
     narrowest = 2.0 * min((o.radius for o in vessel.openings), default=math.nan)
     return Derived(
@@ -136,8 +139,8 @@ def derive(scene: Scene, vessel: Vessel, blood_count: int, proxy_count: int) -> 
         support_radius=radius,
         expected_speed=speed,
         sound_speed=sound,
-        quiet_speed=min(quiet_speed(scene, vessel), speed or 1.0) if is_closed(scene) else None,
+        quiet_speed=quiet,
         step=limits.smallest,
-        reynolds_number=scene.blood.density * speed * narrowest / scene.blood.rheology.viscosity,
+        reynolds_number=scene.blood.density * usual * narrowest / scene.blood.rheology.viscosity,
         particles_across_narrowest=narrowest / grid.spacing,
     )

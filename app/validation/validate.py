@@ -14,7 +14,7 @@ from rich.text import Text
 
 from app import version
 from app.files import check_json, check_plots, console, write_json
-from app.validation import boundaries, delivered, pipes, statics, viscosity
+from app.validation import beginnings, boundaries, delivered, pipes, statics, viscosity
 from app.validation.report import Report, Row
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.runtime import start
@@ -48,6 +48,7 @@ CASES = (
     ),
     Case("hydrostatic", "hydrostatic column", "f32", statics.hydrostatic),
     Case("poiseuille", "Poiseuille flow in a tube", "f32", pipes.poiseuille),
+    Case("pipe", "steady flow in a tube", "f32", pipes.steady_pipe, 5),
     Case("womersley", "Womersley flow in a tube", "f32", pipes.womersley),
     Case("casson", "Casson blood in a tube", "f32", pipes.casson),
     Case("dam_break", "dam break", "f32", statics.dam_break),
@@ -55,6 +56,7 @@ CASES = (
     Case("pulse", "a wall that pulses", "f32", boundaries.pulse),
     Case("wound", "bleeding from a wound", "f32", boundaries.wound),
     Case("tool", "sphere in a tank", "f32", boundaries.tool),
+    Case("start", "how runs begin", "f32", beginnings.start_of_runs, 4),
 )
 
 

@@ -98,8 +98,10 @@ def colouring(of: str, simulation: "Simulation") -> Colouring:
     """The colouring of a simulation's blood by one of COLOURINGS."""
     if of == "age":
         return Colouring(of, AGE_COLOURS, _largest_age(simulation), "s", "new")
-    # Free fall over the whole height, or what drives: little is faster.
-    return Colouring(of, SPEED_COLOURS, simulation.derived.expected_speed or 1.0, "m/s", "at rest")
+    # Free fall over the whole height, or what drives: little is faster, but a jet out of a wound.
+    derived = simulation.derived
+    fastest = derived.quiet_speed or derived.expected_speed or 1.0
+    return Colouring(of, SPEED_COLOURS, fastest, "m/s", "at rest")
 
 
 def _largest_age(simulation: "Simulation") -> float:
