@@ -20,6 +20,7 @@ Everything is dimensionless, so weights serve any spacing whose scene has the sa
 the step is T = C R/c with the trained C, the sound speed c and the support radius R the scene's.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -164,6 +165,7 @@ class DirectPcNet:
     """
 
     name = "pcnet"
+    largest_viscosity = math.inf
 
     def __init__(
         self,
@@ -250,6 +252,11 @@ class PressurePcNet:
     @sound_speed.setter
     def sound_speed(self, sound_speed: float) -> None:
         self.implicit.sound_speed = sound_speed
+
+    @property
+    def largest_viscosity(self) -> float:
+        """Bound of mu [Pa s]: the implicit model's."""
+        return self.implicit.largest_viscosity
 
     @property
     def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float]:

@@ -1,5 +1,6 @@
 """Diagnostics: what a frame says about the state of the blood, and why a run had to stop."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from taichi_sph.boundary.outlets import OUT_OF_BOX, SUCTION
 from taichi_sph.boundary.tracer import Tracer
+from taichi_sph.fluid.model import AccelerationModel
 
 FEW = 0.2
 """Part of the blood below which its centre of mass says little."""
@@ -40,6 +42,8 @@ class Diagnostics:
     """Largest speed [m/s]."""
     fallback_share: float
     """Part of the simulated time in which the model fell back to the physics."""
+    viscosity_bounded: float = 0.0
+    """Part of the blood whose viscosity the model held at its bound in the last step."""
     added_volume: float = 0.0
     """Volume that was driven in [m^3]."""
     bled_volume: float = 0.0
@@ -58,6 +62,14 @@ def compression(density: np.ndarray, rest_density: float) -> tuple[float, float]
     return float(np.percentile(excess, 99)), float(excess.max())
 
 
+def viscosity_bounded(model: AccelerationModel, count: int) -> float:
+    """Part of the first `count` rows whose viscosity a model held at its bound in the last step."""
+    if model.pair_coefficients is None or count == 0 or math.isinf(model.largest_viscosity):
+        return 0.0
+    viscosity = model.pair_coefficients[2].to_numpy()[:count]
+    return float((viscosity >= model.largest_viscosity * (1.0 - 1e-5)).mean())
+
+
 def diagnose(
     simulation: Any,
     density: np.ndarray,
@@ -67,6 +79,7 @@ def diagnose(
     bled: int = 0,
     sucked: int = 0,
     mean_age: dict[str, float] | None = None,
+    bounded: float = 0.0,
 ) -> Diagnostics:
     """Diagnostics of a simulation, ours or one that is read as ours is.
 
@@ -79,6 +92,7 @@ def diagnose(
         bled: particles that have left through wounds.
         sucked: particles that were aspirated.
         mean_age: of what has left [s], by opening.
+        bounded: part of the blood whose viscosity the model held at its bound.
     """
     volume = simulation.particles.mass / simulation.scene.blood.density
     rest_density = simulation.scene.blood.density
@@ -101,6 +115,7 @@ def diagnose(
         kinetic_energy=float(0.5 * simulation.particles.mass * speed2.sum()),
         max_speed=float(np.sqrt(speed2.max(initial=0.0))),
         fallback_share=simulation.fallback_share,
+        viscosity_bounded=bounded,
         mean_age=mean_age or {},
     )
 
@@ -125,6 +140,7 @@ def diagnose_vessel(simulation: Any) -> Diagnostics:
         simulation, density, drained, leaks, added=simulation.inflow.added,
         bled=int(left[len(names) :].sum()), sucked=int(counts[SUCTION]),
         mean_age=mean_age,
+        bounded=viscosity_bounded(simulation.model, simulation.particles.count[None]),
     )  # fmt: skip
 
 

@@ -75,6 +75,8 @@ class Summary:
     """Blood that pumps and reservoirs have added [m^3]."""
     fallback_share: float
     """Part of the simulated time in which the model fell back to the physics."""
+    most_viscosity_bounded: float
+    """Largest part of the blood, of all frames, whose viscosity the model held at its bound."""
     diverged: bool
     ending: str
 
@@ -183,7 +185,7 @@ def drive(
     signals, stopped = _Signals(), None
     error: RunError | OSError | None = None
     step_times: list[float] = []
-    most_leaks, most_compression = 0, 0.0
+    most_leaks, most_compression, most_bounded = 0, 0.0, 0.0
     began, first_time = time.perf_counter(), simulation.time
     with signals.caught():
         figures = simulation.diagnostics()
@@ -192,6 +194,7 @@ def drive(
             while True:
                 most_leaks = max(most_leaks, figures.leaks)
                 most_compression = max(most_compression, figures.compression_p99)
+                most_bounded = max(most_bounded, figures.viscosity_bounded)
                 for observer in observers:
                     observer.on_frame(simulation, frame, figures)
                 if progress:
@@ -232,6 +235,7 @@ def drive(
         steps=steps, frames=frame, wall_time=wall_time,
         real_time_factor=(figures.time - first_time) / wall_time,
         most_leaks=most_leaks, most_compression_p99=most_compression,
+        most_viscosity_bounded=most_bounded,
         diverged=isinstance(error, RunError), ending=ending,
     )  # fmt: skip
     return Outcome(summary, error, stopped, tuple(stalled))

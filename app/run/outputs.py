@@ -192,4 +192,9 @@ def summary_text(summary: Summary) -> str:
         lines.append(f"  mean time in the vessel of what left: {by_opening}")
     if s.fallback_share:
         lines.append(f"  the physics took over for {1e2 * s.fallback_share:.2g} % of the time")
+    if s.most_viscosity_bounded:
+        lines.append(
+            f"  viscosity was held at what the step of {s.model} bears in up to "
+            f"{1e2 * s.most_viscosity_bounded:.2g} % of the blood: a shorter step shows it whole"
+        )
     return "\n".join(lines)

@@ -1,6 +1,7 @@
 """Scenes: the shipped ones, the user's own, and what one amounts to."""
 
 import difflib
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -189,6 +190,25 @@ def _sound_speed(scene: Scene, derived: "Derived") -> str:
     )
 
 
+def delivered_viscosity(scene: Scene) -> str | None:
+    """How much more viscous a shipped scene's blood is than it asks for, by each model.
+
+    From the rows of `vesselflow validate viscosity --json`, kept beside the scenes; None of a
+    scene that is not there, or is not as it was shipped.
+    """
+    file = vessels_folder() / "viscosity.json"
+    known = shipped()
+    if scene.name not in known or scene.text != known[scene.name].read_text(encoding="utf-8"):
+        return None
+    found = []
+    for row in json.loads(file.read_text(encoding="utf-8"))["rows"]:
+        case, _, _ = row["quantity"].partition(":")
+        name, _, model = case.partition(", ")
+        if name == scene.name:
+            found.append(f"{1.0 + row['error']:.2g} ({model})")
+    return ", ".join(found) or None
+
+
 def info_tables(scene: Scene) -> list[Table]:
     """What a scene amounts to: the vessel's check, then the numbers that follow from it.
 
@@ -201,7 +221,7 @@ def info_tables(scene: Scene) -> list[Table]:
     for finding in findings:
         checks.add_row(_OK if finding.good else _NOTE, finding.text)
 
-    grid = scene.discretization
+    grid, viscous = scene.discretization, delivered_viscosity(scene)
     numbers = _two_columns("\nderived numbers")
     for name, value in (
         ("blood particles", f"{derived.blood_particles}"),
@@ -214,6 +234,7 @@ def info_tables(scene: Scene) -> list[Table]:
         ("time step", f"{1e3 * derived.step:.3g} ms"),
         ("steps, about", f"{scene.duration / derived.step:.0f} for {scene.duration:g} s"),
         ("Reynolds number", f"{derived.reynolds_number:.3g}"),
+        *([] if viscous is None else [("viscosity, over what is asked for", viscous)]),
         (
             "proxy spacing reached",
             f"{wall.nearest_mean:.3f} of {1e3 * grid.wall_spacing_ratio * grid.spacing:.4g} mm, "

@@ -3,6 +3,7 @@
 A method is a model at a setting.  Methods of one `curve` are joined by a line on the chart.
 """
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,11 @@ class Stretched:
         return self.model.used_fallback
 
     @property
+    def largest_viscosity(self) -> float:
+        """As the model's."""
+        return self.model.largest_viscosity
+
+    @property
     def sound_speed(self) -> float:
         """As the model's."""
         return self.model.sound_speed
@@ -177,6 +183,7 @@ class Ballistic:
     name = "ballistic"
     used_fallback = False
     pair_coefficients = None
+    largest_viscosity = math.inf
 
     def __init__(self, fluid: Fluid, capacity: int):
         """It keeps nothing but the liquid."""

@@ -132,6 +132,12 @@ class ImplicitAcceleration:
         return self._interval_at_start * (self.fluid.sound_speed / self.sound_speed)
 
     @property
+    def largest_viscosity(self) -> float:
+        """Bound of mu, LARGEST_VISCOSITY rho_0 R^2/T [Pa s]."""
+        radius = self.fluid.kernel.support_radius
+        return LARGEST_VISCOSITY * self.fluid.rest_density * radius**2 / self.interval
+
+    @property
     def pair_coefficients(self) -> tuple[Fluid, ti.Field, ti.Field, float]:
         """Constants, p/rho^2, mu and c."""
         return self.fluid, self.pressure_term, self.viscosity, self.sound_speed

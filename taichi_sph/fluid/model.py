@@ -24,6 +24,11 @@ class AccelerationModel(Protocol):
     """Present sound speed c [m/s]; a simulation sets it before a step."""
 
     @property
+    def largest_viscosity(self) -> float:
+        """Bound that mu is held at for the step [Pa s]; infinite where the step gives way."""
+        ...
+
+    @property
     def used_fallback(self) -> bool:
         """Whether the last acceleration is the physics', since the model did not trust itself."""
         ...

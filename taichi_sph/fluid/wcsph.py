@@ -13,6 +13,8 @@ Sound is damped by a pressure that answers to the rate at which density rises, a
 density, does not feel it, as it would Monaghan's artificial viscosity.
 """
 
+import math
+
 import taichi as ti
 
 from taichi_sph.fluid.density import density_sums
@@ -38,6 +40,7 @@ class SphAcceleration:
 
     name = "physics"
     used_fallback = False
+    largest_viscosity = math.inf
 
     def __init__(self, fluid: Fluid, capacity: int):
         """Make the scratch fields for `capacity` particles."""

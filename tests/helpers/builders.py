@@ -4,6 +4,7 @@ Taichi frees no field and compiles every kernel anew for new fields or constants
 tests put their own particles on one of three stages instead of allocating.
 """
 
+import math
 import subprocess
 import sys
 from collections.abc import Callable
@@ -105,6 +106,7 @@ class Prescribed:
     used_fallback: bool = False
     pair_coefficients: None = None
     sound_speed: float = 1.0
+    largest_viscosity: float = math.inf
 
     def accelerate(self, particles, wall, neighbors, gravity) -> None:
         """Write the law's acceleration and the rest density."""

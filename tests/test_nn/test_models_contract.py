@@ -15,6 +15,7 @@ from clouds import SCALES
 from nn.features import NAMES, NETWORK_COUNT, PAPER_COUNT, FeatureScales
 from nn.pcnet import make_pcnet
 from nn.weights import Training, Weights
+from taichi_sph.diagnostics import viscosity_bounded
 from taichi_sph.fluid.implicit import ImplicitAcceleration
 from taichi_sph.fluid.model import AccelerationModel, Fluid
 from taichi_sph.fluid.rheology import Casson
@@ -211,3 +212,18 @@ def test_a_model_at_another_sound_speed_is_the_one_that_is_made_for_it(name):
     if name != "ballistic":
         before = accelerations(stage, model_named(name))
         assert np.abs(found[0][0] - before).max() > 1e-3 * np.abs(before).max()
+
+
+def test_a_bound_of_viscosity_that_acts_is_counted():
+    stage, count = sphere(), 0
+    for longer, expected in ((1e-3, 0.0), (1e3, 1.0)):
+        model = ImplicitAcceleration(FLUID, CAPACITY, longer * SCALES.frame_interval)
+        put(stage, *blood(SPHERE - 0.2 * D))
+        accelerations(stage, model)
+        count = stage.particles.count[None]
+        viscosity = stage.in_order(model.viscosity)
+        assert viscosity.max() <= model.largest_viscosity * (1.0 + 1e-6)
+        assert viscosity_bounded(model, count) == expected
+    physics = model_named("physics")
+    accelerations(stage, physics)
+    assert viscosity_bounded(physics, count) == 0.0

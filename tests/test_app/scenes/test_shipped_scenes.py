@@ -1,7 +1,9 @@
+import msgspec
 import numpy as np
 import pytest
 
-from app.scenes.library import find_scene, measure, shipped
+from app.models import MODELS
+from app.scenes.library import delivered_viscosity, find_scene, measure, shipped
 from taichi_sph.simulation import Simulation
 
 STEPS = 20
@@ -53,3 +55,14 @@ def test_info_counts_flow_extensions_and_buffers_as_a_run_does():
     assert derived.blood_particles == len(start.blood) == room + BUFFERS
     assert start.in_lumen == room
     assert start.left_out == 0
+
+
+def test_info_tells_how_viscous_the_blood_of_a_shipped_scene_is_and_of_no_other():
+    for name in shipped():
+        found = delivered_viscosity(find_scene(name))
+        assert found is not None
+        for model in MODELS:
+            assert f"({model})" in found, name
+    scene = find_scene("box")
+    assert delivered_viscosity(msgspec.structs.replace(scene, text=scene.text + "\n")) is None
+    assert delivered_viscosity(msgspec.structs.replace(scene, name="mine")) is None
