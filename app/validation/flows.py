@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from taichi_sph.boundary.boundary import BloodFlow
 from taichi_sph.fluid.calibration import calibrate
@@ -22,6 +23,7 @@ from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
+from taichi_sph.runtime import float_dtype
 from taichi_sph.scene import Scene
 from taichi_sph.simulation import Simulation
 
@@ -53,6 +55,9 @@ SLAB = 8
 
 FAR = 1e6
 """A time that no step reaches [s]: `Simulation.step(FAR)` takes the longest stable step."""
+
+NO_WAY = 1e-12
+"""Amplitude of a wall that slides [m]."""
 
 SKIN = 0.2
 """Skin of the lists over the support radius."""
@@ -141,8 +146,12 @@ def make_simulation(
     box: tuple[np.ndarray, np.ndarray],
     period: np.ndarray,
     body_force: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    wall_velocity: np.ndarray | None = None,
 ) -> Simulation:
-    """Blood and wall in a box (lower, upper) [m]; body force per mass [m/s^2]."""
+    """Blood and wall in a box (lower, upper) [m]; body force per mass [m/s^2].
+
+    Proxies with a velocity [m/s], (m, 3), slide: they stay where they are.
+    """
     fluid = liquid.fluid()
     kernel, skin = fluid.kernel, SKIN * fluid.kernel.support_radius
     reach = kernel.support_radius + skin
@@ -153,6 +162,8 @@ def make_simulation(
         fluid.calibration.setback,
         liquid.wall_spacing,
         period if period.any() else None,
+        # What moves has a velocity; so little moves nothing.
+        amplitude=None if wall_velocity is None else np.full(len(wall_position), NO_WAY),
     )
     neighbors = Neighbors.allocate(
         make_grid(*box, reach, period),
@@ -163,8 +174,12 @@ def make_simulation(
         wall,
     )
     particles = Particles.from_numpy(position, velocity, fluid.calibration.mass)
+    blood = BloodFlow(particles, wall, neighbors, body_force)
+    if wall_velocity is not None:
+        rows = cKDTree(wall_position).query(wall.position.to_numpy()[: wall.count])[1]
+        wall.velocity.from_numpy(wall_velocity[rows].astype(float_dtype()))
     return Simulation(
-        BloodFlow(particles, wall, neighbors, body_force),
+        blood,
         SphAcceleration(fluid, len(position)),
         speed_limit=liquid.sound_speed,
     )

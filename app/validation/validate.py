@@ -14,7 +14,7 @@ from rich.text import Text
 
 from app import version
 from app.files import check_json, check_plots, console, write_json
-from app.validation import beginnings, boundaries, delivered, pipes, statics, viscosity
+from app.validation import beginnings, boundaries, cavity, delivered, pipes, statics, viscosity
 from app.validation.report import Report, Row
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.runtime import start
@@ -46,6 +46,7 @@ CASES = (
         viscosity.taylor_green_3d,
         30,
     ),
+    Case("cavity", "lid-driven cavity", "f32", cavity.lid_driven_cavity, 15),
     Case("hydrostatic", "hydrostatic column", "f32", statics.hydrostatic),
     Case("poiseuille", "Poiseuille flow in a tube", "f32", pipes.poiseuille),
     Case("pipe", "steady flow in a tube", "f32", pipes.steady_pipe, 5),
