@@ -48,7 +48,7 @@ class FakeSession:
         self.simulation: Any = SimpleNamespace(
             scene=self.scene,
             vessel=self.vessel,
-            derived=SimpleNamespace(expected_speed=1.0),
+            derived=SimpleNamespace(expected_speed=1.0, quiet_speed=None),
             tool=self.tool,
             wounds=self.wounds,
             inflow=SimpleNamespace(openings=[]),

@@ -37,6 +37,7 @@ class FakeSimulation:
             blood_particles=particles,
             proxy_particles=10,
             expected_speed=1.0,
+            quiet_speed=None,
             sound_speed=10.0,
             support_radius=2e-3,
         )
