@@ -13,7 +13,7 @@ from taichi_sph.fluid.rheology import make_rheology
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.scene import Scene
-from taichi_sph.waveform import read_waveform
+from taichi_sph.waveform import RAMP_TIME, read_waveform
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
     pressures = [(0.0, 0.0), *_reservoir_pressures(scene)]
     span = max(high for _, high in pressures) - min(low for low, _ in pressures)
     jet = math.sqrt(2.0 * (head + span / scene.blood.density))
-    flow, squeezed = _largest_flow(scene), _squeezed(scene, vessel)
+    flow, squeezed = _largest_flow(scene)[0], _squeezed(scene, vessel)
     if flow > 0.0:
         jet = max(jet, 2.0 * flow / (0.25 * math.pi * vessel.narrowest**2))
     if squeezed > 0.0:
@@ -68,30 +68,37 @@ def expected_speed(scene: Scene, vessel: Vessel) -> float:
 def is_closed(scene: Scene) -> bool:
     """Whether blood fills the lumen and no opening leads outside, but one at least to a reservoir.
 
-    Only differences of pressure move blood then, until a wound is opened.
+    Only differences of pressure move blood then, until a wound is opened.  Where the wall pulses,
+    blood follows it by the whole pressure: such a vessel is not closed.
     """
     uncapped = [table for table in scene.openings.values() if table.state == "open"]
     return (
         scene.column.full
+        and scene.wall is None
         and all(table.driven for table in uncapped)
         and any(table.pressure is not None for table in uncapped)
     )
 
 
 def quiet_speed(scene: Scene, vessel: Vessel) -> float:
-    """Largest speed that the drive of a closed scene gives blood while nothing is wounded [m/s].
+    """Largest speed U_q that the drive of a closed scene asks sound to suit, unwounded [m/s].
 
-    Of the reservoirs' difference of pressures, sqrt(2 p/rho), or of a parabolic profile in their
-    openings of all that flows, 2 Q/A, whichever is more.
+        U_q^2 = (2 Q/A)^2 + 2 (p/rho + L (dQ/dt)/A)
+
+    of a parabolic profile of all that pumps drive through the reservoirs' openings, of the
+    difference of the reservoirs' pressures, and of what accelerates a column as long as the vessel.
     """
     pressures = list(_reservoir_pressures(scene))
     span = max(high for _, high in pressures) - min(low for low, _ in pressures)
     tables = scene.openings
     ends = [o for o in vessel.openings if o.name in tables and tables[o.name].pressure is not None]
     area = sum(opening.area for opening in ends)
-    through = 2.0 * (_largest_flow(scene) + _squeezed(scene, vessel)) / area
+    flow, change = _largest_flow(scene)
+    low, high = vessel.bounds
+    column = float((high - low).max()) * change / area
+    head = span / scene.blood.density + column
     # Where only a wound lets blood flow: as fast as out of it.
-    return max(math.sqrt(2.0 * span / scene.blood.density), through) or math.inf
+    return math.hypot(2.0 * flow / area, math.sqrt(2.0 * head)) or math.inf
 
 
 def _reservoir_pressures(scene: Scene) -> Iterator[tuple[float, float]]:
@@ -102,14 +109,16 @@ def _reservoir_pressures(scene: Scene) -> Iterator[tuple[float, float]]:
             yield float(pressure.min()), float(pressure.max())
 
 
-def _largest_flow(scene: Scene) -> float:
-    """Sum of what pumps drive at their peaks [m^3/s]."""
-    flow = 0.0
+def _largest_flow(scene: Scene) -> tuple[float, float]:
+    """Sums of what pumps drive at their peaks [m^3/s], and of its steepest change [m^3/s^2]."""
+    flow = change = 0.0
     for table in scene.openings.values():
         if table.flow is not None:
-            wave = read_waveform(table.waveform, Path(scene.folder)).factor
-            flow += float(np.abs(wave * table.flow).max())
-    return flow
+            wave = read_waveform(table.waveform, Path(scene.folder))
+            flow += float(np.abs(wave.factor * table.flow).max())
+            slope = np.abs(np.diff(wave.factor) / np.diff(wave.time)).max(initial=0.0)
+            change += abs(table.flow) * max(float(slope), 1.0 / RAMP_TIME)
+    return flow, change
 
 
 def _squeezed(scene: Scene, vessel: Vessel) -> float:

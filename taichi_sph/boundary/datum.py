@@ -17,7 +17,8 @@ wounded.
 
 A wound feels the whole pressure: once one is open, D and the balance of gravity are taken back
 within CHANGE_TIME, while c rises to what a jet out of the whole pressure asks for; and back when it
-is closed.  In other scenes there is no datum and c is constant.
+is closed.  In other scenes, also where the wall pulses and blood follows it by the
+whole pressure, there is no datum and c is constant.
 
 | symbol | here | meaning | unit |
 |---|---|---|---|
@@ -39,7 +40,7 @@ from taichi_sph.fluid.model import AccelerationModel
 
 LEAST_PRESSURE = 0.1
 """m: with 0.5 the pressure of `aorta_surgery` was three times as high, and rang."""
-CHANGE_TIME = 0.02
+CHANGE_TIME = 0.01
 """Time in which D is taken back, or comes back [s]: sound crosses a vessel of 0.1 m meanwhile."""
 RISE_TIME, FALL_TIME = 0.005, 0.05
 """Times in which c may rise or fall by a factor e [s]: a fast rise keeps up with a jet; a fall, or
