@@ -90,7 +90,7 @@ class Tool(Boundary):
         if blood.wall.tool and model.pair_coefficients is not None:
             force = force_on_tool(
                 blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients,
-                blood.datum.value, *blood.datum.gradient,
+                *self._datum(),
             )  # fmt: skip
             self._impulse += dt * np.array([force[0], force[1], force[2]])
             self._impulse_time += dt
@@ -107,6 +107,15 @@ class Tool(Boundary):
         self.last_displacement = self.move(dt)
         self.write_proxies()
         return self.last_displacement
+
+    def _datum(self) -> tuple[float, float, float, float]:
+        """The datum over its value at the tool: at the origin [Pa], and its gradient [Pa/m].
+
+        A vessel that has a datum is closed, and a level of pressure on all sides of the tool does
+        nothing, but to particles, whose sum over its surface is not quite zero.
+        """
+        gradient = self.blood.datum.gradient
+        return -float(np.dot(gradient, self.position)), *gradient
 
     def update_velocity(self) -> None:
         """Choose the velocity for the next step; of a tool with a surface, as `move`."""
@@ -166,7 +175,7 @@ class Tool(Boundary):
         if blood.wall.tool and model.pair_coefficients is not None:
             force_on_tool(
                 blood.particles, blood.wall, blood.neighbors, *model.pair_coefficients,
-                blood.datum.value, *blood.datum.gradient,
+                *self._datum(),
             )  # fmt: skip
 
     def reset(self) -> None:

@@ -245,7 +245,7 @@ def force_on_tool(
 ) -> ti.math.vec3:
     """Force F = -m sum_i sum_k a_ik over the proxies of the tool [N], as in `sum_acceleration`.
 
-    m is the blood that a particle stands for.  The tool feels the whole pressure, the datum too:
+    m is the blood that a particle stands for.  To the pressure is added what a datum takes from it:
     its value at the origin [Pa] and its gradient [Pa/m].
     Reads: position, velocity, density, scratch.
     """

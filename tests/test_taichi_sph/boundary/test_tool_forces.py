@@ -20,9 +20,12 @@ from builders import (
 )
 from nn.features import ROW_COUNT, SPEED_KURTOSIS, SPEED_SKEWNESS, FeatureScales, extract
 from reference import Blood
+from taichi_sph.boundary.boundary import BloodFlow, Datum
+from taichi_sph.boundary.tool import Tool
 from taichi_sph.fluid.implicit import ImplicitAcceleration
 from taichi_sph.fluid.rheology import Casson
 from taichi_sph.fluid.wcsph import force_on_tool, sum_acceleration
+from taichi_sph.geometry.mesh import enclosed_volume
 from tool_stage import AT, TURN, hold, proxies
 
 SUMS = {"f64": 1e-11, "f32": 2e-4}
@@ -222,3 +225,19 @@ def test_what_the_tool_takes_from_blood_is_momentum_of_the_blood_that_particles_
     mass = stage.particles.mass
     limit = SUMS[precision()] * mass * np.abs(with_tool).sum()
     np.testing.assert_allclose(found, -mass * taken, rtol=1e-6, atol=limit)
+
+
+def test_a_datum_with_a_gradient_lifts_the_tool_by_what_it_displaces(stage, surface):
+    stage.accelerate(BLOOD)
+    at_rest = force(stage, BLOOD)
+    displaced = enclosed_volume(surface.vertices, surface.faces)
+    blood = BloodFlow(stage.particles, stage.wall, stage.neighbors, (0.0, 0.0, 0.0))
+    for axis in range(3):
+        slope = 1e4 * np.eye(3)[axis]
+        blood.datum = Datum(7e3, tuple(slope), 1.0)
+        tool = Tool(blood, None, np.zeros(3))
+        lifted = force(stage, BLOOD, tool._datum()) - at_rest
+        # A ball of two spacings in blood that has not settled.
+        np.testing.assert_allclose(
+            lifted, -displaced * slope, rtol=0, atol=0.25 * displaced * slope.max()
+        )
