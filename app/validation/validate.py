@@ -46,10 +46,10 @@ CASES = (
         viscosity.taylor_green_3d,
         30,
     ),
-    Case("cavity", "lid-driven cavity", "f32", cavity.lid_driven_cavity, 15),
+    Case("cavity", "lid-driven cavity", "f32", cavity.lid_driven_cavity, 32),
     Case("hydrostatic", "hydrostatic column", "f32", statics.hydrostatic),
     Case("poiseuille", "Poiseuille flow in a tube", "f32", pipes.poiseuille),
-    Case("pipe", "steady flow in a tube", "f32", pipes.steady_pipe, 5),
+    Case("pipe", "steady flow in a tube", "f32", pipes.steady_pipe, 6),
     Case("womersley", "Womersley flow in a tube", "f32", pipes.womersley),
     Case("casson", "Casson blood in a tube", "f32", pipes.casson),
     Case("dam_break", "dam break", "f32", statics.dam_break),
@@ -57,7 +57,7 @@ CASES = (
     Case("pulse", "a wall that pulses", "f32", boundaries.pulse),
     Case("wound", "bleeding from a wound", "f32", boundaries.wound),
     Case("tool", "sphere in a tank", "f32", boundaries.tool),
-    Case("start", "how runs begin", "f32", beginnings.start_of_runs, 4),
+    Case("start", "how runs begin", "f32", beginnings.start_of_runs, 5),
 )
 
 
