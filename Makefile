@@ -8,8 +8,7 @@ SCENE ?= aortoiliac
 OPTIONS ?=
 
 BIN := .venv/bin
-# What is imported is compiled then; to compile all of torch takes a minute.
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 INSTALLED := .venv/.installed
 DEVELOPS := .venv/.installed-dev
 
@@ -43,7 +42,8 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(DEVELOPS): pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable '.[dev]'
+	# What is imported is compiled then; to compile all of torch takes a minute.
+	$(PIP) --no-compile --editable '.[dev]'
 	@touch $@ $(INSTALLED)
 
 clean:
