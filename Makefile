@@ -20,7 +20,7 @@ run: $(INSTALLED)
 	$(BIN)/vesselflow run $(SCENE) --rrd recordings/$(notdir $(basename $(SCENE))).rrd $(OPTIONS)
 
 test: lint
-	$(BIN)/pytest --numprocesses 2 --dist loadgroup --durations=25
+	$(BIN)/pytest --numprocesses 2 --dist loadfile --durations=25
 
 validation: $(DEVELOPS)
 	$(BIN)/pytest -m validation --durations=25

@@ -32,19 +32,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--bounds", action="store_true", help="check bounds of field accesses (slow)")
 
 
-ONE_PROCESS = ("test_taichi_sph/boundary", "test_app/control")
-"""Folders whose tests share simulations, each compiled once if one process has them all."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one process have all tests of a file, or of a folder of ONE_PROCESS."""
-    here = Path(__file__).parent
-    for item in items:
-        file = item.path.relative_to(here).as_posix()
-        folder = next((f for f in ONE_PROCESS if file.startswith(f)), file)
-        item.add_marker(pytest.mark.xdist_group(folder))
-
-
 @pytest.fixture(scope="session", autouse=True)
 def runtime(request: pytest.FixtureRequest) -> None:
     option = request.config.getoption
