@@ -3,7 +3,7 @@
 A lattice that is cut to the lumen leaves a void of up to half a spacing at the wall, and other
 blood at every spacing.  A finer lattice with as many particles as the lumen has room for is let go:
 
-    v_i = 0.9 (v_i + a_i dt),   x_i += v_i dt / 0.9,   dt = C h_s/c
+    v_i += a_i dt,   x_i += (v_i + w_i) dt,   v_i *= 0.9,   dt = C h_s/c
 
 under the physics without gravity, for STEPS steps.  Blood in the buffers of driven
 openings stays where it is.  Curved walls push the first layer farther in than half a spacing: what
@@ -49,7 +49,7 @@ def settle(blood: BloodFlow, fluid: Fluid, inflow: Any, count: int) -> Floats:
     """
     particles = blood.particles
     start = particles.in_order(particles.position)
-    key = _key(start, blood, fluid)
+    key = _key(start, blood, fluid, count)
     settled = _load(key)
     if settled is None:
         settled = _settled(blood, fluid, inflow, count)
@@ -102,14 +102,12 @@ def slow(p: ti.template(), kept: float):
         p.velocity[i] *= kept
 
 
-def _key(start: Floats, blood: BloodFlow, fluid: Fluid) -> str:
+def _key(start: Floats, blood: BloodFlow, fluid: Fluid, count: int) -> str:
     """Hash of all that the positions follow from."""
     text = hashlib.sha256()
     for values in (start, *blood.wall.given):
         text.update(np.ascontiguousarray(values, "<f4").tobytes())
-    text.update(
-        repr((ALGORITHM, str(start.dtype), fluid.kernel.support_radius, fluid.spacing)).encode()
-    )
+    text.update(repr((ALGORITHM, str(start.dtype), count, fluid)).encode())
     return text.hexdigest()[:40]
 
 

@@ -83,30 +83,36 @@ class PressureDatum(Boundary):
             most = dt / CHANGE_TIME
             share = self.blood.datum.share
             wanted = 0.0 if any(wound.is_open for wound in self.wounds) else 1.0
-            self._put(share + min(most, max(-most, wanted - share)), dt)
-            self._follow(dt, self.quiet_speed)
+            heads = self._heads(dt)
+            self._put(share + min(most, max(-most, wanted - share)), heads)
+            self._follow(dt, heads, self.quiet_speed)
         return 0.0
 
-    def _put(self, share: float, dt: float) -> None:
-        """Such a share of the datum, of the pressures a step of dt [s] from now."""
-        gradient = self.density * np.asarray(self.blood.gravity)
+    def _heads(self, dt: float) -> list[float]:
+        """p_0 - rho_0 g.x of each reservoir a step of dt [s] from now [Pa]."""
+        time, gradient = self.blood.time + dt, self._gradient
+        return [
+            opening.pressure_at(time, dt) - float(gradient @ opening.opening.centre)
+            for opening in self.driven
+            if opening.pressure is not None
+        ]
+
+    @property
+    def _gradient(self) -> np.ndarray:
+        """rho_0 g [Pa/m]."""
+        return self.density * np.asarray(self.blood.gravity)
+
+    def _put(self, share: float, heads: list[float]) -> None:
+        """Put such a share of the datum there, of the reservoirs' heads [Pa]."""
         scale = self.blood.sound_speed / self.ratio
-        lowest = min(self._above(gradient, dt)) - LEAST_PRESSURE * self.density * scale**2
-        x, y, z = (float(share * a) for a in gradient)
+        lowest = min(heads) - LEAST_PRESSURE * self.density * scale**2
+        x, y, z = (float(share * a) for a in self._gradient)
         self.blood.datum = Datum(share * lowest, (x, y, z), share)
 
-    def _above(self, gradient: np.ndarray, dt: float) -> Iterable[float]:
-        """p_0 - rho_0 g.x of each reservoir [Pa]."""
-        time = self.blood.time + dt
-        for opening in self.driven:
-            if opening.pressure is not None:
-                yield opening.pressure_at(time, dt) - float(gradient @ opening.opening.centre)
-
-    def _follow(self, dt: float, quiet_speed: float) -> None:
+    def _follow(self, dt: float, heads: list[float], quiet_speed: float) -> None:
         """Let the sound speed follow the flow for a step of dt [s]."""
         wanted = self.sound_speed
         if self.blood.datum.share == 1.0:
-            heads = list(self._above(self.density * np.asarray(self.blood.gravity), dt))
             speed = max(
                 self.blood.largest_speed,
                 math.sqrt(2.0 * (max(heads) - min(heads)) / self.density),
@@ -122,7 +128,7 @@ class PressureDatum(Boundary):
         self.blood.datum = Datum()
         if self.quiet_speed is not None:
             self.blood.sound_speed = self.ratio * self.quiet_speed
-            self._put(1.0, 0.0)
+            self._put(1.0, self._heads(0.0))
 
     def save_state(self) -> dict[str, Any]:
         """The datum and the sound speed."""

@@ -67,6 +67,7 @@ def test_a_position_belongs_to_the_buffer_that_numpy_says(driven):
     out = np.zeros((len(x), 4), float_dtype())
     number_of(driven.inflow.regions, x, out)
     expected = buffer_numbers(x.astype(float), driven)
+    np.testing.assert_array_equal(driven.inflow.regions.number_at(x.astype(float)), expected)
     # In f32 a few lie on a face to within rounding.
     same = out[:, 0] == expected
     assert same.mean() >= {"f64": 1.0, "f32": 0.9995}[precision()]

@@ -6,16 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from driven_tube import DENSITY, ENDS, LENGTH, OF_ONE, VISCOSITY, D, area, drive, make_tube
-from meshes import RADIUS
+from driven_tube import DENSITY, ENDS, LENGTH, OF_ONE, D, area, drive, make_tube
 from taichi_sph.boundary.inflow import buffer_layers
 from taichi_sph.simulation import Simulation
 from taichi_sph.waveform import RAMP_TIME
 
 REST = 0.02
 """Of the jet's speed that the pressure would make, sqrt(2 p/rho): sound still rings."""
-SAME = 0.03
-"""Of the pressure: two plugs whose particles are packed differently press so much differently."""
 RINGING = 0.05
 """Of the pressure: its mean over a few periods of the sound that is left."""
 PUSHED = 0.1
@@ -45,10 +42,7 @@ def test_blood_between_reservoirs_of_one_pressure_comes_to_rest_under_it(driven,
     assert np.abs(speeds).max() < 0.1 * jet
     risen = np.minimum(1.0, 0.002 * np.arange(1, 76) / RAMP_TIME)
     assert np.abs(pressure - 100.0 * risen).max() < 30.0
-    # What drifts on is what a few per cent of the pressure would drive (Poiseuille).
-    length = driven.particles.count[None] * OF_ONE / area(driven)
-    loss = 8.0 * VISCOSITY * length * np.abs(speeds[-25:].mean(axis=0)).max() / RADIUS**2
-    assert loss < SAME * 100.0
+    assert np.abs(speeds[-25:].mean(axis=0)).max() < 0.5 * REST * jet
     assert math.sqrt((speeds[-25:] ** 2).mean()) < REST * jet
     # A plug presses with p on what its strands take up; the blood before it is on all the opening.
     taken = area(driven) / driven.inflow.openings[0].opening.area
