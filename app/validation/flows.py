@@ -173,7 +173,7 @@ def make_simulation(
         liquid.spacing,
         wall,
     )
-    particles = Particles.from_numpy(position, velocity, fluid.calibration.mass)
+    particles = Particles.from_numpy(position, velocity, DENSITY * liquid.spacing**3)
     blood = BloodFlow(particles, wall, neighbors, body_force)
     if wall_velocity is not None:
         rows = cKDTree(wall_position).query(wall.position.to_numpy()[: wall.count])[1]
@@ -291,7 +291,8 @@ def tube(
     count = round(math.pi * radius**2 * layers / d**2)
     x = rings(radius, d, length) if ordered else scattered(radius, d, length, count)
     setback = liquid.fluid().calibration.setback
-    wall, normal = tube_wall(radius + setback, liquid.wall_spacing, 0.0, length, True)
+    surface, normal = tube_wall(radius, liquid.wall_spacing, 0.0, length, True)
+    wall = surface + setback * normal
     edge = radius + setback + liquid.kernel.support_radius
     simulation = make_simulation(
         liquid, x, None, wall, normal,

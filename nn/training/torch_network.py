@@ -93,6 +93,7 @@ class TrainingSample:
         self.wall_by_pressure = as_f32(
             np.stack([np.bincount(i, push[:, a], n) for a in range(3)], 1)
         )
+        slope *= blood.wall.friction.to_numpy()[k]
         drag = 2.0 * factors.wall_friction * slope * r2 / ((r2 + eps) * density[i] ** 2)
         self.wall_by_viscosity = as_f32(np.bincount(i, drag, n)[:, None] * v)
 

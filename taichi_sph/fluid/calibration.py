@@ -62,15 +62,26 @@ def _slope(kernel: WendlandC2, points: np.ndarray) -> np.ndarray:
     return kernel.slope_of(np.linalg.norm(points, axis=1))
 
 
+def _plane(kernel: WendlandC2, wall_spacing: float) -> np.ndarray:
+    """Square lattice of proxies within a support radius of one, along two axes [m], (n, 2)."""
+    k = int(np.ceil(kernel.support_radius / wall_spacing))
+    axis = wall_spacing * np.arange(-k, k + 1)
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+
+
+def plane_proxy_volume(kernel: WendlandC2, wall_spacing: float) -> float:
+    """V_k of Eq. 3, gamma = 1, in a plane square lattice of proxies [m^3]."""
+    plane = _plane(kernel, wall_spacing)
+    return float(1.0 / kernel.w_of(np.linalg.norm(plane, axis=1)).sum())
+
+
 def _wall_sums(kernel: WendlandC2, d: float, wall_spacing: float, depth: float) -> np.ndarray:
     """Sums over proxies `depth` [m] below: W, force, friction, gradient of simple shear.
 
     Averaged over where the particle stands above the proxies.
     """
-    k = int(np.ceil(kernel.support_radius / wall_spacing))
-    axis = wall_spacing * np.arange(-k, k + 1)
-    plane = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-    proxy_volume = 1.0 / kernel.w_of(np.linalg.norm(plane, axis=1)).sum()
+    plane = _plane(kernel, wall_spacing)
+    proxy_volume = plane_proxy_volume(kernel, wall_spacing)
     eps = softening(kernel)
     sums = np.zeros(4)
     shifts = wall_spacing * (np.arange(8) + 0.5) / 8.0

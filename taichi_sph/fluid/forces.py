@@ -13,6 +13,7 @@ network's pressure head, and the force on a tool.
 | rho, mu | rho, mu | density, viscosity | kg/m^3, Pa s |
 | tau | stress | viscous stress | Pa |
 | V_k | w.volume | volume of a proxy (Eq. 3, gamma = 1) | m^3 |
+| F_k | w.friction | factor of the friction where the wall is curved | 1 |
 
 Arguments are plain: a Taichi struct would fix their precision when this file is imported, before
 Taichi is started.
@@ -93,7 +94,7 @@ def wall_pair_acceleration(
     """Acceleration by a proxy over rho_0, a_ik/rho_0 (Eqs. 15 and 16) [m^4/(kg s^2)].
 
     a_ik = -gamma rho_0 V_k (p_i/rho_i^2 + Pi_ik) grad W_ik
-           + gamma_mu rho_0 V_k 2 mu_i/rho_i^2 (r_ik.grad W_ik)/(r_ik^2 + eps) v_ik
+           + gamma_mu rho_0 F_k V_k 2 mu_i/rho_i^2 (r_ik.grad W_ik)/(r_ik^2 + eps) v_ik
 
     The proxy has the density and viscosity of the particle and, unlike the print's, no pressure:
     see `taichi_sph.fluid.calibration`.  p_i is the particle's p/rho^2.
@@ -110,4 +111,5 @@ def wall_pair_acceleration(
     # The quotient by rho_i rho_k does not depend on k and leaves the loop.
     friction = ti.static(2.0 * fluid.calibration.wall_friction) * mu_i / (rho_i * rho_i)
     a_ik = -(ti.static(fluid.calibration.wall_density) * w.volume[k] * pressure * slope) * r_ik
-    return a_ik + pair_viscosity(w.volume[k] * friction, slope, r2, softened, 1.0, 1.0) * v_ik
+    friction *= w.friction[k] * w.volume[k]
+    return a_ik + pair_viscosity(friction, slope, r2, softened, 1.0, 1.0) * v_ik

@@ -178,7 +178,7 @@ def sum_acceleration(
                + m 2 mu_ij/(rho_i rho_j) (r_ij.grad W_ij)/(r_ij^2 + eps) v_ij
     Wall:
         a_ik = -gamma rho_0 V_k (p_i/rho_i^2 + Pi_ik) grad W_ik
-               + gamma_mu rho_0 V_k 2 mu_i/rho_i^2 (r_ik.grad W_ik)/(r_ik^2 + eps) v_ik
+               + gamma_mu rho_0 F_k V_k 2 mu_i/rho_i^2 (r_ik.grad W_ik)/(r_ik^2 + eps) v_ik
 
     | symbol | code | meaning | unit |
     |---|---|---|---|
@@ -187,6 +187,7 @@ def sum_acceleration(
     | Pi_ij | | artificial viscosity, part of `pressure` | m^5/(kg s^2) |
     | mu_i, mu_ij | mu_i, mu_ij | viscosity, of a pair with its calibration and a factor 2 | Pa s |
     | gamma, gamma_mu | calibration.wall_density, wall_friction | of Eq. 3 | 1 |
+    | F_k | w.friction | where the wall is curved | 1 |
     | a_i | a_i, a_wall | by blood, by the wall | m/s^2 |
 
     Reads: position, velocity, density, scratch.  Writes: acceleration.

@@ -122,7 +122,7 @@ class Neighbors:
         cell = (c[:, 0] * self.grid.shape[1] + c[:, 1]) * self.grid.shape[2] + c[:, 2]
         cells = proxies.cell_start.shape[0] - 1
         cell = np.minimum(self.rank.to_numpy()[cell], cells - 1)
-        order = np.argsort(cell, kind="stable")
+        order = wall.order = np.argsort(cell, kind="stable")
         # One kernel for all: each field's own would cost some 0.05 s at start.
         place_proxies(wall, proxies, *(a[order] for a in given))
         move_wall(wall, proxies, wall.displacement_factor, wall.rate)

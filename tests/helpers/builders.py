@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
+from scipy.spatial import cKDTree
 
 from reference import Blood
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
@@ -26,7 +27,7 @@ from taichi_sph.particles.grid import make_grid
 from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
-from taichi_sph.particles.wall import Proxies, Wall, proxy_volumes
+from taichi_sph.particles.wall import Proxies, Wall, proxy_volumes, wall_curvature
 from taichi_sph.simulation import Simulation
 
 D = 1e-3
@@ -156,7 +157,9 @@ class Setup:
     def put_wall(self, position: np.ndarray, normal: np.ndarray) -> None:
         """Replace the proxies (as many) and sort them."""
         volume = proxy_volumes(position, KERNEL, self.period)
-        self.wall.given = Proxies(position, normal, volume, np.zeros(len(position)), volume)
+        curvature = wall_curvature(position, normal, KERNEL, self.wall.setback, self.period)
+        still = np.zeros(len(position))
+        self.wall.given = Proxies(position, normal, volume, still, volume, curvature)
         self.neighbors.sort_wall(self.wall)
 
     def build(self) -> None:
@@ -206,7 +209,16 @@ class Setup:
             n=getattr(rheology, "n", 0.0),
             factors=vars(c),
             period=self.period,
+            curvature=self.curvature(),
         )
+
+    def curvature(self) -> np.ndarray:
+        """Of the wall at each proxy, in the order of the grid, times h_s."""
+        given, m = self.wall.given, self.wall.count
+        if m == 0:
+            return np.zeros(0)
+        rows = cKDTree(given.position).query(self.wall.position.to_numpy()[:m])[1]
+        return given.curvature[rows]
 
 
 @cache

@@ -84,12 +84,15 @@ class Blood:
     factors: dict[str, float]
     """Calibration: mass, viscosity, gradient and those of the wall."""
     period: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    curvature: np.ndarray | float = 0.0
+    """Of the wall at each proxy, times h_s, (m,)."""
 
     def __post_init__(self) -> None:
         self.x, self.v, self.y = (np.asarray(a, dtype=np.float64) for a in (self.x, self.v, self.y))
         self.r = separations(self.x, self.x, self.period)
         self.r_wall = separations(self.x, self.y, self.period)
         self.volume = proxy_volumes(self.y, self.support, self.period)
+        self.friction_volume = self.volume * (1.0 + 0.85 * self.curvature**2)
         self.mass = self.factors["mass"]
         # 0.01 h_s^2 with h_s = R/2.
         self.eps = 0.01 * (self.support / 2.0) ** 2
@@ -192,8 +195,8 @@ class Blood:
         return -self.mass * np.einsum("ij,ija->ia", q[:, None] + q[None, :], self.grad)
 
     def surrounded(self, rho: np.ndarray) -> np.ndarray:
-        """0 under 0.93 of the rest density, 1 over 0.98."""
-        return np.clip((rho / self.rest_density - 0.93) / 0.05, 0.0, 1.0)
+        """0 under 0.90 of the rest density, 1 over 0.95."""
+        return np.clip((rho / self.rest_density - 0.90) / 0.05, 0.0, 1.0)
 
     def alpha_at(self, rho: np.ndarray) -> np.ndarray:
         """Monaghan's alpha: everywhere, and of thin blood beside it."""
@@ -250,7 +253,7 @@ class Blood:
 
     def wall_friction_acceleration(self, nested: bool = False) -> np.ndarray:
         """Eq. 16 in Morris' form: mu_k = mu_i, rho_k = rho_i, v_k = 0 [m/s^2]."""
-        psi = self.factors["wall_friction"] * self.rest_density * self.volume
+        psi = self.factors["wall_friction"] * self.rest_density * self.friction_volume
         rg = np.einsum("ika,ika->ik", self.r_wall, self.grad_wall)
         rg = rg / ((self.r_wall**2).sum(-1) + self.eps)
         factor = 2.0 * self.viscosity(nested) / self.rho**2 * (rg @ psi)

@@ -48,8 +48,8 @@ class Moving(Blood):
 
     v_k: np.ndarray
 
-    def move(self, volume: np.ndarray, v_k: np.ndarray) -> "Moving":
-        self.volume, self.v_k = volume, v_k
+    def move(self, volume: np.ndarray, friction: np.ndarray, v_k: np.ndarray) -> "Moving":
+        self.volume, self.friction_volume, self.v_k = volume, volume * friction, v_k
         self.rho = self.density()
         self.p = self.pressure(self.rho)
         return self
@@ -75,6 +75,7 @@ class Moving(Blood):
         rho = self.rho[:, None]
         psi = self.rest_density * self.volume[None]
         if term == "friction":
+            psi = self.rest_density * self.friction_volume[None]
             mu = self.viscosity(nested)[:, None]
             rg = (self.r_wall * self.grad_wall).sum(-1)
             factor = 2.0 * self.factors["wall_friction"] * psi * mu / rho**2 * rg / r2
@@ -92,8 +93,8 @@ def brute_force(stage: Setup, fluid) -> Moving:
     """The state in the fields, proxies of wall and tool alike."""
     known = vars(stage.reference(fluid))
     arguments = {name: known[name] for name in Blood.__dataclass_fields__}
-    moving = Moving(**{**arguments, "y": proxies(stage)})
-    return moving.move(proxies(stage, "volume"), proxies(stage, "velocity"))
+    moving = Moving(**{**arguments, "y": proxies(stage), "curvature": 0.0})
+    return moving.move(*(proxies(stage, name) for name in ("volume", "friction", "velocity")))
 
 
 def assert_close(found: np.ndarray, expected: np.ndarray, relative: float) -> None:
@@ -115,7 +116,7 @@ def test_what_a_tool_that_moves_and_turns_does_to_blood_is_brute_force(stage, su
     expected = moving.acceleration(np.array([1.0, -2.0, -9.81]), nested=fluid.nested)
     assert_close(found, expected, SUMS[precision()] + SERIES)
     # The motion is large enough to be missed.
-    still = moving.move(moving.volume, 0.0 * moving.v_k)
+    still = moving.move(moving.volume, moving.friction_volume / moving.volume, 0.0 * moving.v_k)
     change = still.acceleration(np.array([1.0, -2.0, -9.81]), nested=fluid.nested) - expected
     assert np.abs(change).max() > 0.01 * np.abs(expected).max()
 

@@ -100,7 +100,8 @@ def opened(name: str) -> Opened:
     setback = calibrate(kernel, spacing, beside, DENSITY).setback
     sample = vessel.sample_wall(beside, setback)
     volume = wall_volumes(sample.positions, kernel)
-    given = Proxies(sample.positions, sample.normals, volume, np.zeros(len(volume)), volume)
+    zero = np.zeros(len(volume))
+    given = Proxies(sample.positions, sample.normals, volume, zero, volume, zero)
     wall = SimpleNamespace(
         given=given, setback=setback, spacing=beside, largest_amplitude=0.0,
         displacement_factor=0.0,
