@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
@@ -33,7 +34,7 @@ from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import make_rheology
 from taichi_sph.geometry.filling import clear_of_proxies
 from taichi_sph.geometry.findings import BEYOND
-from taichi_sph.geometry.mesh import Floats
+from taichi_sph.geometry.mesh import Booleans, Floats
 from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.geometry.wall_sampling import WallSample
 from taichi_sph.particles.grid import cells_within, make_grid
@@ -41,8 +42,8 @@ from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
-from taichi_sph.scene import Scene
-from taichi_sph.settling import settle
+from taichi_sph.scene import Column, Scene
+from taichi_sph.settling import Plane, settle
 from taichi_sph.waveform import read_waveform
 
 SKIN = 0.1
@@ -165,11 +166,11 @@ def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
     neighbors = _make_neighbors(plan, particles.capacity, wall)
     blood = BloodFlow(particles, wall, neighbors, scene.gravity)
     boundaries = _make_boundaries(plan, blood, derived)
-    if scene.column.full:
-        inflow = next(b for b in boundaries if isinstance(b, BufferZones))
-        initial = settle(blood, fluid, inflow, start.in_lumen)
-        derived = replace(derived, blood_particles=len(initial))
-        inflow.reset()  # identities go on after those that are left
+    inflow = next(b for b in boundaries if isinstance(b, BufferZones))
+    top = None if scene.column.full else _opening_plane(plan)
+    initial = settle(blood, fluid, inflow, start.in_lumen, top)
+    derived = replace(derived, blood_particles=len(initial))
+    inflow.reset()  # identities go on after those that are left
     return Assembly(scene, vessel, derived, fluid, initial, blood, boundaries)
 
 
@@ -218,13 +219,11 @@ def _initial_state(plan: _Plan, seed: int) -> InitialState:
     setback = plan.calibration.setback
     sample = plan.vessel.sample_wall(plan.wall_spacing, setback, seed)
     proxies, normals, amplitudes = _proxies(plan, sample)
-    column, left_out = _column(plan, proxies, plan.spacing)
-    if plan.scene.column.full:
-        column, left_out = _full_lumen(plan, proxies, column), 0
+    column = _column(plan, proxies)
     buffers = buffer_blood(plan.driven, column, plan.spacing, plan.layers)
     clear = clear_of_proxies(buffers, proxies, plan.spacing, setback)
     blood = np.concatenate([column, buffers[clear]])
-    left_out += int((~clear).sum())
+    left_out = int((~clear).sum())
     return InitialState(blood, len(column), left_out, sample, setback, proxies, normals, amplitudes)
 
 
@@ -256,46 +255,64 @@ def _proxies(plan: _Plan, sample: WallSample) -> tuple[Floats, Floats, Floats]:
     return np.concatenate(positions), np.concatenate(normals), np.concatenate(amplitudes)
 
 
-def _column(plan: _Plan, proxies: Floats, spacing: float) -> tuple[Floats, int]:
-    """A lattice in the column (n, 3) [m], and how many of its places the proxies take.
+def _lattice(plan: _Plan, proxies: Floats, column: Column, spacing: float) -> Floats:
+    """A lattice in a column (n, 3) [m], less what the proxies and the tool take.
+
+    Raises:
+        InputError: the column does not fit.
+    """
+    places = plan.vessel.fill_column(column, spacing)
+    places = places[_beside_tool(plan, places, 0.5 * spacing)]
+    return places[clear_of_proxies(places, proxies, spacing, plan.calibration.setback)]
+
+
+def _beside_tool(plan: _Plan, places: Floats, clear: float) -> Booleans:
+    """Which places (n, 3) [m] lie outside the tool, farther from it than `clear` [m], (n,)."""
+    if plan.tool is None or len(places) == 0:
+        return np.ones(len(places), bool)
+    apart = places - plan.tool_position
+    return (plan.tool.distance(apart) > clear) & plan.tool.outside(apart)
+
+
+def _column(plan: _Plan, proxies: Floats) -> Floats:
+    """As many particles as the column has room for (n, 3) [m]: places of a finer lattice.
+
+    A lattice of the blood's own spacing leaves a void at the wall, and at every spacing another
+    one.  These are too close to each other, until `taichi_sph.settling` lets them go.
 
     Raises:
         InputError: the column does not fit, or the proxies take all of its places.
     """
-    column = plan.vessel.fill_column(plan.scene.column, spacing)
-    if plan.tool is not None and len(column):
-        apart = column - plan.tool_position
-        clear = plan.tool.distance(apart) > 0.5 * spacing
-        column = column[clear & plan.tool.outside(apart)]
-    clear = clear_of_proxies(column, proxies, spacing, plan.calibration.setback)
-    if not clear.any():
+    spacing, column = plan.spacing, plan.scene.column
+    places = _lattice(plan, proxies, column, spacing)
+    if len(places) == 0:
         raise InputError(
-            f"column: no place at {plan.scene.column.opening!r} is far enough from the wall at "
-            f"spacing {plan.spacing:g} m; choose a finer spacing"
+            f"column: no place at {column.opening!r} is far enough from the wall at "
+            f"spacing {spacing:g} m; choose a finer spacing"
         )
-    return column[clear], int((~clear).sum())
-
-
-def _full_lumen(plan: _Plan, proxies: Floats, column: Floats) -> Floats:
-    """As many particles as the lumen has room for (n, 3) [m]: places of a finer lattice.
-
-    A lattice of the blood's own spacing, `column`, leaves a void at the wall.  These are too close
-    to each other, until `taichi_sph.settling` lets them go.
-    """
-    room = plan.vessel.volume
+    room = plan.vessel.column_room(column, spacing)
+    volume = room.volume
+    if not column.full:
+        # A lattice as deep, whatever its spacing; as many particles may be less than a layer.
+        column = msgspec.structs.replace(column, height=max(room.height, spacing), particles=None)
     if plan.tool is not None:
-        places = plan.vessel.fill_column(plan.scene.column, plan.spacing)
-        room -= (~plan.tool.outside(places - plan.tool_position)).sum() * plan.spacing**3
-    wanted = round(room / plan.spacing**3)
-    spacing = plan.spacing
+        every = plan.vessel.fill_column(column, spacing)
+        volume -= float((~_beside_tool(plan, every, 0.0)).sum()) * spacing**3
+    wanted = round(volume / spacing**3)
     for _ in range(FILLING_ROUNDS):
-        if len(column) >= wanted:
+        places = _lattice(plan, proxies, column, spacing)
+        if len(places) >= wanted:
             break
         # A little finer than in proportion, for what is cut off at the wall does not shrink alike.
-        spacing *= 0.999 * (len(column) / wanted) ** (1.0 / 3.0)
-        column, _ = _column(plan, proxies, spacing)
-    kept = np.random.default_rng(0).permutation(len(column))[:wanted]
-    return column[np.sort(kept)]
+        spacing *= 0.999 * (max(1, len(places)) / wanted) ** (1.0 / 3.0)
+    kept = np.random.default_rng(0).permutation(len(places))[:wanted]
+    return places[np.sort(kept)]
+
+
+def _opening_plane(plan: _Plan) -> Plane:
+    """Half a spacing below the opening that the column stands at: above it blood would leave."""
+    opening = plan.vessel.opening(plan.scene.column.opening)
+    return Plane(opening.centre - 0.5 * plan.spacing * opening.normal, opening.normal)
 
 
 def _room(plan: _Plan, count: int) -> int:

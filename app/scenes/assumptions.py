@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-from taichi_sph.errors import InputError
 from taichi_sph.geometry.mesh import Floats
 from taichi_sph.geometry.vessel import LEAST_ACROSS, Vessel
 from taichi_sph.scene import Column
@@ -114,28 +113,23 @@ def choose_column(
     # As deep as a little over the opening is wide, within the bounds; at any rate one radius.
     radius_deep = _a_radius_deep(vessel, step)
     wanted = round(min(max(min(DEEP * radius_deep, MOST), FEWEST, radius_deep), TOO_MANY))
-    while True:
-        try:
-            blood = vessel.fill_column(Column(opening=top.name, particles=wanted), step)
-            break
-        except InputError:
-            if wanted < 100:
-                raise
-            wanted //= 2
-    depth = float(((top.centre - blood) @ top.normal).max()) + 0.5 * step
-    layers = max(1, round(depth / step))
-    height = float(f"{layers * step:.6g}")
-    blood = vessel.fill_column(Column(opening=top.name, height=height), step)
+    room = vessel.column_room(Column(opening=top.name, particles=wanted), step)
+    while room.volume < (1.0 - 1e-6) * wanted * step**3 and wanted >= 100:
+        wanted //= 2
+        room = vessel.column_room(Column(opening=top.name, particles=wanted), step)
+    height = float(f"{max(1, round(room.height / step)) * step:.6g}")
+    column = Column(opening=top.name, height=height)
+    vessel.fill_column(column, step)  # it fits, or says why not
+    count = round(vessel.column_room(column, step).volume / step**3)
     notes.append(
-        f"column: {len(blood)} blood particles, {1e3 * height:.3g} mm deep, at {top.name}, the "
-        "largest"
+        f"column: {count} blood particles, {1e3 * height:.3g} mm deep, at {top.name}, the largest"
     )
-    if len(blood) > 2 * MOST:
+    if count > 2 * MOST:
         thinnest = vessel.narrowest_opening or top
         way_out = f'state = "capped" in [openings.{thinnest.name}] and a coarser spacing'
         way_out = "a coarser --spacing" if spacing is not None else f"{way_out}, or --spacing"
         notes.append(
-            f"warning: {len(blood)} blood particles, where {FEWEST} to {MOST} are aimed at: the "
+            f"warning: {count} blood particles, where {FEWEST} to {MOST} are aimed at: the "
             f"narrowest place, {1e3 * vessel.narrowest:.3g} mm at {thinnest.name}, sets the "
             f"spacing; {way_out}, makes them fewer"
         )

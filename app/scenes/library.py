@@ -205,7 +205,8 @@ def delivered_viscosity(scene: Scene) -> str | None:
         case, _, _ = row["quantity"].partition(":")
         name, _, model = case.partition(", ")
         if name == scene.name:
-            found.append(f"{1.0 + row['error']:.2g} ({model})")
+            felt, asked = (float(row[key].split()[0]) for key in ("computed", "theory"))
+            found.append(f"{felt / asked:.3g} ({model})")
     return ", ".join(found) or None
 
 

@@ -33,6 +33,7 @@ from nn.dataset.schema import (
 from nn.dataset.writer import RunWriter, committed_states, merge
 from nn.features import PAPER_COUNT, TABLE_VERSION, FeatureScales
 from nn.training.rollout import ReplaySimulation
+from taichi_sph.assemble import initial_state
 from taichi_sph.derived import derive
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.geometry.vessel import read_vessel
@@ -190,7 +191,8 @@ def plan(
         column = msgspec.structs.replace(
             scene.column, height=float(height), particles=None, full=False
         )
-        blood = vessel.fill_column(column, scene.discretization.spacing)
+        column_scene = msgspec.structs.replace(scene, column=column)
+        blood = initial_state(column_scene, vessel, seed).blood
         derived = derive(scene, vessel, len(blood), 0)
         metadata = RunMetadata(
             scene=scene.text,
@@ -216,7 +218,7 @@ def plan(
         jobs.append(
             RecordingJob(
                 number,
-                msgspec.structs.replace(scene, column=column),
+                column_scene,
                 metadata,
                 part,
                 threads,

@@ -1,4 +1,4 @@
-"""Blood at the start: a cubic lattice of particles in the lumen behind an opening.
+"""Blood at the start: a cubic lattice of particles in the lumen behind an opening, and its room.
 
 What belongs to the column is what hangs together with the opening inside the lumen, place by
 place: what merely lies beside it, in another branch, does not.
@@ -30,6 +30,8 @@ speed: the run diverges."""
 _BLOCKED = 0.05
 """Half-way between two neighbours the wall is farther than this [spacings], or it is between them:
 each of them keeps half a spacing."""
+_FINER = 0.5
+"""Spacing of the lattice that measures a column's room, over the blood's."""
 _TOP_LAYERS = 3
 """Where the rim is oblique the first layers may hold no particle."""
 
@@ -62,6 +64,9 @@ class _Lattice:
 
     allowed: Booleans
     """Where particles may stand (layers, p, q)."""
+    height: Floats
+    """Distance of each place from the surface, negative outside; as far as it is worked out, else
+    -inf (layers, p, q) [m]."""
     points: Floats
     """Positions (layers, p, q, 3) [m]."""
     depth: Floats
@@ -70,6 +75,16 @@ class _Lattice:
     """Places straight below the opening, in the lumen all the way (top layers, p, q)."""
     blocked: tuple[Booleans, ...]
     """Per axis: neighbours (at a place and at the next along it) with a wall between them."""
+
+    def volumes(self, spacing: float) -> Floats:
+        """Volume of each layer's places that hang together with the opening [m^3], (layers,).
+
+        A place at the surface counts with the part of its cube that lies within.
+        """
+        joined = self.joined(len(self.depth))
+        beside = ndimage.binary_dilation(joined, np.ones((3, 3, 3))) & ~self.allowed
+        within = np.clip(0.5 + self.height / spacing, 0.0, 1.0)
+        return np.asarray(spacing**3 * np.where(joined | beside, within, 0.0).sum(axis=(1, 2)))
 
     def joined(self, layers: int) -> Booleans:
         """The places of the first layers that hang together with the opening through others."""
@@ -110,8 +125,9 @@ def _neighbours(dimensions: int, axis: int) -> tuple[tuple[slice, ...], tuple[sl
 
 
 def _lattice(
-    lumen: Lumen, opening: Opening, rim: Floats, spacing: float, offset: float, deepest: float
-) -> _Lattice:
+    lumen: Lumen, opening: Opening, rim: Floats, spacing: float, offset: float, deepest: float,
+    clear: float = 0.5,
+) -> _Lattice:  # fmt: skip
     """Cubic lattice behind an opening: where particles may stand.
 
     Args:
@@ -121,6 +137,7 @@ def _lattice(
         spacing: Of the lattice [m].
         offset: A layer boundary lies this far below the plane [m].
         deepest: Layers go no deeper than this [m].
+        clear: Places keep as far from the wall [spacings].
     """
     first, second = mesh.plane_axes(opening.normal)
     apart = lumen.vertices - opening.centre
@@ -143,13 +160,18 @@ def _lattice(
     possible = _coarse(lumen, axes, directions, opening.centre, spacing)
     places = points[possible]
     allowed = lumen.contains(places)
-    clearance = np.zeros(points.shape[:3])
-    clearance[possible] = np.where(allowed, _distances(lumen, places, allowed), 0.0)
-    grid = clearance >= (0.5 - _TOLERANCE) * spacing
+    clearance = np.full(points.shape[:3], -np.inf)
+    if clear > 0.0:
+        clearance[possible] = np.where(allowed, _distances(lumen, places, allowed), -np.inf)
+    else:
+        clearance[possible] = np.where(allowed, 1.0, -1.0) * lumen.distance(places)
+    grid = clearance >= (clear - _TOLERANCE) * spacing
+    if clear == 0.0:
+        grid[possible] &= allowed
     top = grid[:_TOP_LAYERS].copy()
     top[top] = _below(lumen, opening, rim, points[:_TOP_LAYERS][top])
     cuts = tuple(_blocked(lumen, grid, points, clearance, axis, spacing) for axis in range(3))
-    return _Lattice(grid, points, depth, top, cuts)
+    return _Lattice(grid, clearance, points, depth, top, cuts)
 
 
 def _distances(lumen: Lumen, places: Floats, wanted: Booleans) -> Floats:
@@ -320,6 +342,53 @@ def _shallowest(
     aside = np.linalg.norm(chosen - last.mean(axis=0), axis=1)
     order = np.lexsort((column, row, np.round(aside / spacing, 6), layer))[:wanted]
     return chosen[order][::-1].copy()
+
+
+@dataclass(frozen=True)
+class Room:
+    """The part of the lumen that a column takes, up to the wall."""
+
+    volume: float
+    """[m^3]"""
+    height: float
+    """From the column's top to its deepest place [m]."""
+
+
+def column_room(
+    lumen: Lumen, opening: Opening, rim: Floats, column: Column, spacing: float
+) -> Room:
+    """The part of the lumen that a column of a height, or of a number of particles, takes.
+
+    Its volume is that of the cubes of a lattice, half as wide as the blood's, as far as they lie in
+    the lumen.  As many particles take as many spacings cubed of it.
+
+    Args:
+        lumen: The closed surface.
+        opening: Where the column stands.
+        rim: Closed polygon round it (m, 3) [m].
+        column: How deep or how many; `fill_column` says whether it fits.
+        spacing: Distance between particles [m].
+    """
+    reach = float(((opening.centre - lumen.vertices) @ opening.normal).max())
+    fine, offset = _FINER * spacing, column.offset
+    if column.height is not None:
+        height = min(column.height, reach - offset)
+        fine = height / math.ceil(height / fine)  # whole layers
+    else:
+        assert column.particles is not None, "a full lumen has the vessel's volume"
+        height = 1.25 * column.particles * spacing**3 / opening.area + 2.0 * spacing
+    while True:
+        height = min(height, reach - offset)
+        lattice = _lattice(lumen, opening, rim, fine, offset, offset + height, 0.0)
+        filled = np.cumsum(lattice.volumes(fine)[lattice.depth > offset])
+        if column.particles is None:
+            return Room(float(filled[-1]), height)
+        wanted = column.particles * spacing**3
+        if filled[-1] >= wanted or height >= reach - offset:
+            full = fine * (1.0 + np.arange(len(filled)))
+            needed = float(np.interp(wanted, np.append(0.0, filled), np.append(0.0, full)))
+            return Room(min(wanted, float(filled[-1])), needed)
+        height *= 1.6
 
 
 def clear_of_proxies(blood: Floats, proxies: Floats, spacing: float, setback: float) -> Booleans:

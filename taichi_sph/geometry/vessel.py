@@ -95,6 +95,20 @@ class Vessel:
         return self._triangles[~is_open[self.face_opening]]
 
     @cached_property
+    def wall_vertices(self) -> Integers:
+        """Vertices that the wall's triangles have, by number, (k,)."""
+        return np.unique(self.wall_faces)
+
+    @cached_property
+    def wall_normals(self) -> Floats:
+        """Unit normals out of the lumen at `wall_vertices`, (k, 3)."""
+        normals = np.zeros((len(self.vertices), 3))
+        vectors = mesh.face_vectors(self.vertices, self.wall_faces)
+        for corner in range(3):
+            np.add.at(normals, self.wall_faces[:, corner], vectors)
+        return mesh.unit(normals[self.wall_vertices])
+
+    @cached_property
     def volume(self) -> float:
         """Volume of the lumen [m^3]."""
         return mesh.enclosed_volume(self.vertices, self._triangles)
@@ -273,6 +287,18 @@ class Vessel:
         opening = self.opening(column.opening)
         rim = self.rim(self.openings.index(opening))
         return filling.fill_column(self, opening, rim, column, spacing)
+
+    def column_room(self, column: Column, spacing: float) -> filling.Room:
+        """The part of the lumen that a column takes: see `filling.column_room`.
+
+        Raises:
+            InputError: its opening is not there.
+        """
+        if column.full:
+            return filling.Room(self.volume, math.inf)
+        opening = self.opening(column.opening)
+        rim = self.rim(self.openings.index(opening))
+        return filling.column_room(self, opening, rim, column, spacing)
 
     @cached_property
     def _narrowest_place(self) -> tuple[float, int]:

@@ -25,6 +25,8 @@ from taichi_sph.geometry.vessel import read_vessel  # noqa: E402
 
 CLOSE = {"f64": 2e-6, "f32": 2e-5}
 """Of the largest acceleration; torch sums in f32."""
+ROUNDED = 2.0**-24
+"""Of rho/rho_0 in f32: over a step it is as much of R/T^2."""
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +93,9 @@ def test_what_torch_trains_is_what_the_kernels_run(stage, head, rounds, precisio
     )
     found = stage.simulation.particles.acceleration.to_numpy()[:n]
     scale = np.abs(expected).max()
-    assert scale > 0.0
-    assert np.abs(found - expected).max() < CLOSE[precision] * scale
+    assert scale > 1e4 * ROUNDED * scales.acceleration
+    close = CLOSE[precision] * scale + ROUNDED * scales.acceleration
+    assert np.abs(found - expected).max() < close
 
 
 def one_step_error(runs: TrainingRuns, weights: Weights) -> float:

@@ -155,7 +155,7 @@ def test_a_shell_within_a_shell_is_refused(closed: bool, tmp_path: Path) -> None
 # Legs side by side
 
 
-@pytest.mark.parametrize(("gap", "count"), [(1.5, 720), (0.2, 768)])
+@pytest.mark.parametrize(("gap", "count"), [(1.5, 1080), (0.2, 1080)])
 def test_the_column_stands_in_its_own_leg(gap: float, count: int, tmp_path: Path) -> None:
     _, scene, vessel = made(tmp_path, hairpin(gap), spacing=SPACING)
     opening = vessel.opening(scene.column.opening)
@@ -179,7 +179,8 @@ def test_a_gap_thinner_than_the_wall_is_named_and_has_no_hole(tmp_path: Path) ->
     apart = np.linalg.norm(between[:, None] - start.wall.positions[None], axis=2).min(axis=1)
     assert apart.max() < SPACING
     nearest = np.linalg.norm(start.blood[:, None] - start.proxies[None], axis=2).min()
-    assert nearest >= 0.5 * SPACING + 0.9 * start.setback
+    # Places are of a finer lattice than the blood's, until it settles.
+    assert nearest >= 0.35 * SPACING + 0.9 * start.setback
 
 
 def test_legs_far_apart_have_no_gap(tmp_path: Path) -> None:
@@ -209,9 +210,10 @@ def test_blood_begins_clear_of_proxies_that_a_sharp_rim_presses_inwards(tmp_path
     start = initial_state(scene, vessel)
     spacing = scene.discretization.spacing
     apart = np.linalg.norm(start.blood[:, None] - start.proxies[None], axis=2).min()
-    assert apart >= 0.5 * spacing + 0.9 * start.setback
-    column = vessel.fill_column(scene.column, spacing)
-    assert start.left_out == len(column) - len(start.blood)
+    assert apart >= 0.35 * spacing + 0.9 * start.setback
+    # Beside the rim is less room than the lumen has, and elsewhere as much more blood.
+    room = vessel.column_room(scene.column, spacing)
+    assert len(start.blood) == round(room.volume / spacing**3)
 
 
 def test_gravity_points_into_the_columns_opening_and_another_way_is_said(tmp_path: Path) -> None:

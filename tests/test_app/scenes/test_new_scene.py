@@ -9,6 +9,7 @@ import trimesh
 from app.scenes.new_scene import create_scene
 from meshes import LENGTH, RADIUS, cylinder
 from places import SHARED
+from taichi_sph.assemble import initial_state
 from taichi_sph.errors import InputError
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.surface_file import load_surface
@@ -32,7 +33,7 @@ def write_stl(path: Path, capped: bool = True, scale: float = 1e3, turn: bool = 
 def read_back(folder: Path) -> tuple[Scene, Vessel, np.ndarray]:
     scene = read_scene(folder / "scene.toml")
     vessel = read_vessel(scene)
-    return scene, vessel, vessel.fill_column(scene.column, scene.discretization.spacing)
+    return scene, vessel, initial_state(scene, vessel).blood
 
 
 @pytest.mark.parametrize("capped", [True, False])

@@ -203,7 +203,8 @@ def test_targets_are_those_of_blood_that_falls(recorded: Recording) -> None:
             np.testing.assert_allclose(target, (0.0, 0.0, -9.81), atol=0.1)
             change = (run.velocity(1).astype(float) - run.velocity(0)) / run.facts.frame_interval
             np.testing.assert_allclose(run.target(0), change, rtol=1e-6)
-            moved = (run.position(1) - run.position(0))[:, 2].mean()
+            # Where blood parts, shifting moves a few; half of it only falls.
+            moved = np.median((run.position(1) - run.position(0))[:, 2])
             # Symplectic Euler with M equal steps: g T^2 (M + 1)/(2 M).
             fall = -9.8 * run.facts.frame_interval**2 * (SUBSTEPS + 1) / (2 * SUBSTEPS)
             assert moved == pytest.approx(fall, rel=0.02)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from taichi_sph.geometry.filling import fill_column
+from taichi_sph.geometry.filling import column_room, fill_column
 from taichi_sph.geometry.openings import Opening
 from taichi_sph.scene import Column
 
@@ -63,3 +63,42 @@ def test_a_column_stays_in_its_leg_however_thin_the_wall_beside_it_is(thickness:
     assert len(blood) == 5 * 10 * (5 if thickness < 0.01 else 4)
     whole = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", full=True), 1.0)
     assert (whole[:, 0] > -edge).any(), "round the foot it goes"
+
+
+def leg(thickness: float) -> tuple[Opening, np.ndarray, float]:
+    """The opening of the left leg, its rim and its area."""
+    edge = -0.5 * thickness
+    rim = np.array([[-HALF, -HALF, 0.0], [edge, -HALF, 0.0], [edge, HALF, 0.0], [-HALF, HALF, 0.0]])
+    area = (HALF + edge) * 2.0 * HALF
+    centre = np.array([0.5 * (edge - HALF), 0.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    return Opening("leg", centre, up, np.sqrt(area / np.pi), area, True), rim, area
+
+
+@pytest.mark.parametrize("thickness", [0.1, 1.0])
+@pytest.mark.parametrize("height", [3.7, 5.0])
+def test_a_columns_room_reaches_to_the_wall_and_down_to_its_height(
+    thickness: float, height: float
+) -> None:
+    opening, rim, area = leg(thickness)
+    room = column_room(Hairpin(thickness), opening, rim, Column(opening="leg", height=height), 1.0)
+    assert room.height == height
+    # Where a cube holds an edge, its distance tells the part within to some tenths.
+    assert room.volume == pytest.approx(area * height, rel=0.02)
+
+
+def test_as_many_particles_as_there_are_take_as_many_spacings_cubed() -> None:
+    opening, rim, area = leg(1.0)
+    lumen, spacing = Hairpin(1.0), 0.2
+    wanted = round(0.5 * area * (DEPTH - FOOT) / spacing**3)
+    room = column_room(lumen, opening, rim, Column(opening="leg", particles=wanted), spacing)
+    assert room.volume == pytest.approx(wanted * spacing**3, rel=1e-12)
+    assert room.height == pytest.approx(0.5 * (DEPTH - FOOT), rel=0.01)
+
+
+def test_more_particles_than_fit_have_the_room_that_there_is() -> None:
+    opening, rim, _ = leg(1.0)
+    lumen = Hairpin(1.0)
+    room = column_room(lumen, opening, rim, Column(opening="leg", particles=10_000), 1.0)
+    # Both legs and what joins them, less the wall between the legs.
+    assert room.volume == pytest.approx(lumen.volume - 2.0 * HALF * (DEPTH - FOOT), rel=0.05)
