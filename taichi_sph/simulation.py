@@ -13,6 +13,7 @@ from taichi_sph.boundary.outlets import Outlets
 from taichi_sph.boundary.suction import Suction
 from taichi_sph.boundary.tool import Tool
 from taichi_sph.boundary.wall_motion import MovingWall
+from taichi_sph.boundary.wall_stress import WallStress
 from taichi_sph.boundary.wounds import Wounds
 from taichi_sph.derived import Derived
 from taichi_sph.diagnostics import Diagnostics, describe_divergence, diagnose_vessel
@@ -265,11 +266,15 @@ class Simulation:
         self._require_runtime()
         n, capacity = len(state.particles["identity"]), self.particles.capacity
         unknown = state.boundaries.keys() - {boundary.name for boundary in self.boundaries}
+        measured = WallStress.name in unknown
+        unknown -= {WallStress.name}
         if n > capacity or unknown:
             raise InputError(
                 f"a state of {n} particles with {', '.join(unknown) or 'nothing'} that the scene "
                 f"has not; there is room for {capacity}"
             )
+        if measured:
+            self.measure_wall_stress()
         before = self.save_state()
         try:
             self._load(state)
@@ -347,6 +352,20 @@ class Simulation:
     def tool(self) -> Tool:
         """The tool: move it, take its force."""
         return self.boundary(Tool)
+
+    def measure_wall_stress(self) -> WallStress:
+        """Sum the friction on the wall from now on, or go on with it: wall shear stress.
+
+        Raises:
+            LookupError: the simulation is not of a scene.
+        """
+        measured = self._find(WallStress)
+        if measured is None:
+            vessel = self.vessel
+            vertices = vessel.vertices[vessel.wall_vertices].astype(float)
+            measured = WallStress(self.blood, self.fluid, vertices, vessel.wall_normals)
+            self.boundaries = (*self.boundaries, measured)
+        return measured
 
     @property
     def wall_motion(self) -> MovingWall | None:

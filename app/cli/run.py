@@ -58,6 +58,13 @@ outputs = options.together(
     ),
     options.colour,
     click.option("--summary", type=output_path, metavar="FILE", help="Write the summary as JSON."),
+    click.option(
+        "--wall-stress",
+        type=output_path,
+        metavar="FILE",
+        help="Write the wall shear stress at the vertices of the wall, its mean, TAWSS and OSI, as "
+        "VTK PolyData (.vtp).",
+    ),
 )
 model = options.together(
     click.option(

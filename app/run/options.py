@@ -40,6 +40,8 @@ class RunOptions:
     """What blood is coloured by, one of `app.view.appearance.COLOURINGS`."""
     summary: Path | None = None
     """JSON file for the summary."""
+    wall_stress: Path | None = None
+    """VTK file for the wall shear stress."""
     particles: int | None = None
     """Blood particles, instead of the scene's column."""
     height: float | None = None

@@ -18,6 +18,7 @@ from app.locks import claimed
 from app.run.checkpoint import Checkpointer
 from app.run.loop import Observer, Outcome, Summary
 from app.run.options import RunOptions
+from app.run.wall_stress_file import BEGINNING, WallStressFile
 from taichi_sph.errors import InputError
 from taichi_sph.scene import Scene
 
@@ -77,11 +78,20 @@ def _checkpointer(
     return Checkpointer(path, options.checkpoint, facts)
 
 
+def _wall_stress(
+    simulation: "Simulation", options: RunOptions, facts: dict[str, Any]
+) -> WallStressFile | None:
+    return None if options.wall_stress is None else WallStressFile(simulation, options.wall_stress)
+
+
 OUTPUTS = {
     "session": Output(
         "--session", RunOptions.session_file, _begins(b'{"format": "vesselflow session')
     ),
     "view": Output("--rrd", lambda options, _: options.rrd, _begins(b"RRF2"), _view),
+    "wall_stress": Output(
+        "--wall-stress", lambda options, _: options.wall_stress, _begins(BEGINNING), _wall_stress
+    ),
     # Last of the observers: what came before it is safe by then.
     "checkpoint": Output("--checkpoint", RunOptions.checkpoint_file, _begins(b"PK"), _checkpointer),
     "summary": Output("--summary", lambda options, _: options.summary, _is_summary),

@@ -85,6 +85,17 @@ def pipe_pulsation_flow_rate(
     return complex(math.pi * radius**2 * drive / (1j * density * frequency) * shape)
 
 
+def pipe_pulsation_wall_stress(
+    radius: float, drive: float, frequency: float, viscosity: float, density: float
+) -> complex:
+    """Wall shear stress of the same as a complex number tau, Re{tau e^(i w t)} [Pa].
+
+    tau = G R J1(i^(3/2) Wo)/(i^(3/2) Wo J0(i^(3/2) Wo)): what the flow rate leaves of the drive.
+    """
+    edge = (1j**1.5) * womersley_number(radius, frequency, viscosity, density)
+    return complex(drive * radius * jv(1, edge) / (edge * jv(0, edge)))
+
+
 def channel_start_up(
     y: np.ndarray, time: float, width: float, drive: float, viscosity: float, density: float
 ) -> np.ndarray:

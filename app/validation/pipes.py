@@ -127,7 +127,7 @@ def steady_pipe(report: Report, quick: bool) -> None:
             background_pressure=LEAST_PRESSURE * DENSITY * speed**2,
         )  # fmt: skip
         motion = flows.tube(liquid, RADIUS, 4.0 * VISCOSITY * speed / RADIUS**2, ordered=False)
-        flows.set_velocity(motion, partial(_parabola, speed=speed))
+        flows.set_velocity(motion, partial(parabola, speed=speed))
         done, all_of_it = sum(work[:number]), sum(work)
         end = (done + work[number]) / all_of_it
         for _ in watched(motion, [WATCHED * diffusion], report, done / all_of_it, end):
@@ -140,7 +140,8 @@ def steady_pipe(report: Report, quick: bool) -> None:
         )  # fmt: skip
 
 
-def _parabola(x: np.ndarray, speed: float) -> np.ndarray:
+def parabola(x: np.ndarray, speed: float) -> np.ndarray:
+    """Velocity (n, 3) [m/s] of steady flow at positions (n, 3) [m], of a largest speed [m/s]."""
     r2 = (x[:, 0] ** 2 + x[:, 1] ** 2) / RADIUS**2
     return np.column_stack([0.0 * r2, 0.0 * r2, speed * (1.0 - r2)])
 

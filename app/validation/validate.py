@@ -14,7 +14,16 @@ from rich.text import Text
 
 from app import version
 from app.files import check_json, check_plots, console, write_json
-from app.validation import beginnings, boundaries, cavity, delivered, pipes, statics, viscosity
+from app.validation import (
+    beginnings,
+    boundaries,
+    cavity,
+    delivered,
+    pipes,
+    statics,
+    viscosity,
+    wall_stress,
+)  # fmt: skip
 from app.validation.report import Report, Row
 from taichi_sph.errors import InputError, RunError
 from taichi_sph.runtime import start
@@ -52,6 +61,7 @@ CASES = (
     Case("pipe", "steady flow in a tube", "f32", pipes.steady_pipe, 6),
     Case("womersley", "Womersley flow in a tube", "f32", pipes.womersley),
     Case("casson", "Casson blood in a tube", "f32", pipes.casson),
+    Case("wall_stress", "wall shear stress", "f32", wall_stress.wall_shear_stress, 10),
     Case("dam_break", "dam break", "f32", statics.dam_break),
     Case("account", "pump and reservoir", "f32", boundaries.account),
     Case("pulse", "a wall that pulses", "f32", boundaries.pulse),
