@@ -21,6 +21,7 @@ from app.validation import (
     delivered,
     pipes,
     statics,
+    torus,
     viscosity,
     wall_stress,
 )  # fmt: skip
@@ -62,6 +63,7 @@ CASES = (
     Case("womersley", "Womersley flow in a tube", "f32", pipes.womersley),
     Case("casson", "Casson blood in a tube", "f32", pipes.casson),
     Case("wall_stress", "wall shear stress", "f32", wall_stress.wall_shear_stress, 10),
+    Case("torus", "flow in a bend", "f32", torus.bends, 50),
     Case("dam_break", "dam break", "f32", statics.dam_break),
     Case("account", "pump and reservoir", "f32", boundaries.account),
     Case("pulse", "a wall that pulses", "f32", boundaries.pulse),

@@ -159,26 +159,18 @@ def _lattice(
     points = _places(axes, directions) + opening.centre
     possible = _coarse(lumen, axes, directions, opening.centre, spacing)
     places = points[possible]
-    allowed = lumen.contains(places)
-    clearance = np.full(points.shape[:3], -np.inf)
-    if clear > 0.0:
-        clearance[possible] = np.where(allowed, _distances(lumen, places, allowed), -np.inf)
-    else:
-        clearance[possible] = np.where(allowed, 1.0, -1.0) * lumen.distance(places)
-    grid = clearance >= (clear - _TOLERANCE) * spacing
-    if clear == 0.0:
-        grid[possible] &= allowed
+    inside = lumen.contains(places)
+    asked = inside if clear > 0.0 else np.ones(len(places), bool)
+    away = np.full(len(places), np.inf)
+    away[asked] = lumen.distance(places[asked])
+    height = np.full(points.shape[:3], -np.inf)
+    height[possible] = np.where(inside, away, -away)
+    grid = np.zeros(points.shape[:3], bool)
+    grid[possible] = inside & (away >= (clear - _TOLERANCE) * spacing)
     top = grid[:_TOP_LAYERS].copy()
     top[top] = _below(lumen, opening, rim, points[:_TOP_LAYERS][top])
-    cuts = tuple(_blocked(lumen, grid, points, clearance, axis, spacing) for axis in range(3))
-    return _Lattice(grid, clearance, points, depth, top, cuts)
-
-
-def _distances(lumen: Lumen, places: Floats, wanted: Booleans) -> Floats:
-    """Distances to the surface [m] of the wanted places (k, 3); 0 for the others, (k,)."""
-    result = np.zeros(len(places))
-    result[wanted] = lumen.distance(places[wanted])
-    return result
+    cuts = tuple(_blocked(lumen, grid, points, height, axis, spacing) for axis in range(3))
+    return _Lattice(grid, height, points, depth, top, cuts)
 
 
 def _below(lumen: Lumen, opening: Opening, rim: Floats, places: Floats) -> Booleans:
@@ -195,12 +187,12 @@ def _below(lumen: Lumen, opening: Opening, rim: Floats, places: Floats) -> Boole
 
 
 def _blocked(
-    lumen: Lumen, grid: Booleans, points: Floats, clearance: Floats, axis: int, spacing: float
+    lumen: Lumen, grid: Booleans, points: Floats, height: Floats, axis: int, spacing: float
 ) -> Booleans:
     """Places whose next one along an axis is beyond a wall: two lumens may all but touch."""
     here, there = _neighbours(grid.ndim, axis)
     near = grid[here] & grid[there]
-    near &= clearance[here] + clearance[there] < (1.0 + 2.0 * _TOLERANCE) * spacing
+    near &= height[here] + height[there] < (1.0 + 2.0 * _TOLERANCE) * spacing
     middle = 0.5 * (points[here][near] + points[there][near])
     between = lumen.distance(middle) < _BLOCKED * spacing
     between |= ~lumen.contains(middle)

@@ -19,6 +19,7 @@ from fake_simulation import FakeSimulation
 from places import ROOT
 from recordings import environment, positions, verify
 from taichi_sph.errors import InputError
+from taichi_sph.geometry.surface_file import load_surface
 
 PATIENCE = 180.0
 """Longest that a busy machine may take for a run of a few seconds [s]."""
@@ -87,7 +88,11 @@ def test_a_run_from_another_folder_leaves_a_recording_and_a_summary(
     scene: Path, tmp_path: Path
 ) -> None:
     rrd, summary = tmp_path / "run.rrd", tmp_path / "summary.json"
-    done = vesselflow("run", scene, "--frames", 3, "--rrd", rrd, "--summary", summary, cwd=tmp_path)
+    wall = tmp_path / "wall.vtp"
+    done = vesselflow(
+        "run", scene, "--frames", 3, "--rrd", rrd, "--summary", summary, "--wall-stress", wall,
+        cwd=tmp_path,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "Taichi" not in done.stdout + done.stderr
     told = json.loads(summary.read_text())
@@ -110,6 +115,10 @@ def test_a_run_from_another_folder_leaves_a_recording_and_a_summary(
     assert sorted(found) == [0, 1, 2, 3]
     assert {len(x) for x in found.values()} == {told["blood_particles"]}
     assert f"recording: {rrd}" in done.stdout
+    vertices, faces = load_surface(wall)
+    lumen, _ = load_surface(shipped()["box"].parent / "lumen.ply")
+    assert len(faces) > 0
+    assert np.ptp(vertices, axis=0) == pytest.approx(np.ptp(lumen, axis=0), rel=1e-6)
 
 
 class Keeper:

@@ -1,6 +1,7 @@
 """Tests of wall shear stress: the force that blood has felt, turned round."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from taichi_sph.boundary.wall_stress import WallStress
 from taichi_sph.errors import RunError
 from taichi_sph.fluid.rheology import Newtonian
 from taichi_sph.geometry.vtk_formats import read_vtp
+from taichi_sph.scene import read_scene
 from taichi_sph.simulation import Simulation
 
 RADIUS = 1e-3
@@ -136,3 +138,22 @@ def test_the_file_is_a_surface_with_the_stress_at_its_points(tube, watched) -> N
     assert found.corners.tolist() == faces.ravel().tolist()
     for name in ("WSS", "TAWSS", "OSI", "ArtificialWSS"):
         assert f'Name="{name}"' in text
+
+
+def test_a_state_that_has_been_watched_is_watched_on(box: Path) -> None:
+    scene = read_scene(box / "scene.toml")
+    first, second = (Simulation.from_scene(scene) for _ in range(2))
+    measured = first.measure_wall_stress()
+    first.advance_to(0.01)
+    assert first.measure_wall_stress() is measured
+    state = first.save_state()
+    second.load_state(state)
+    found, expected = second.measure_wall_stress().result(), measured.result()
+    assert found.time == expected.time == pytest.approx(0.01)
+    np.testing.assert_array_equal(found.tawss, expected.tawss)
+    assert found.tawss.max() > 0.0
+    vessel = first.vessel
+    assert len(found.vertices) == len(vessel.wall_vertices)
+    # The lumen is a box: normals at its corners point out of it.
+    middle = 0.5 * (found.vertices.min(axis=0) + found.vertices.max(axis=0))
+    assert (((found.vertices - middle) * found.normals).sum(axis=1) > 0.0).all()

@@ -50,21 +50,6 @@ class Hairpin:
         return np.minimum(to_box, np.abs(self._beyond_wall(points)))
 
 
-@pytest.mark.parametrize("thickness", [1e-3, 0.1, 1.0])
-def test_a_column_stays_in_its_leg_however_thin_the_wall_beside_it_is(thickness: float) -> None:
-    edge = -0.5 * thickness
-    rim = np.array([[-HALF, -HALF, 0.0], [edge, -HALF, 0.0], [edge, HALF, 0.0], [-HALF, HALF, 0.0]])
-    area = (HALF + edge) * 2.0 * HALF
-    centre, up = np.array([0.5 * (edge - HALF), 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    opening = Opening("leg", centre, up, np.sqrt(area / np.pi), area, True)
-    blood = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", height=5.0), 1.0)
-    assert (blood[:, 0] < edge).all()
-    # 5 layers of 10 by 5 places, or by 4 where the wall takes one.
-    assert len(blood) == 5 * 10 * (5 if thickness < 0.01 else 4)
-    whole = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", full=True), 1.0)
-    assert (whole[:, 0] > -edge).any(), "round the foot it goes"
-
-
 def leg(thickness: float) -> tuple[Opening, np.ndarray, float]:
     """The opening of the left leg, its rim and its area."""
     edge = -0.5 * thickness
@@ -73,6 +58,18 @@ def leg(thickness: float) -> tuple[Opening, np.ndarray, float]:
     centre = np.array([0.5 * (edge - HALF), 0.0, 0.0])
     up = np.array([0.0, 0.0, 1.0])
     return Opening("leg", centre, up, np.sqrt(area / np.pi), area, True), rim, area
+
+
+@pytest.mark.parametrize("thickness", [1e-3, 0.1, 1.0])
+def test_a_column_stays_in_its_leg_however_thin_the_wall_beside_it_is(thickness: float) -> None:
+    opening, rim, _ = leg(thickness)
+    edge = -0.5 * thickness
+    blood = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", height=5.0), 1.0)
+    assert (blood[:, 0] < edge).all()
+    # 5 layers of 10 by 5 places, or by 4 where the wall takes one.
+    assert len(blood) == 5 * 10 * (5 if thickness < 0.01 else 4)
+    whole = fill_column(Hairpin(thickness), opening, rim, Column(opening="leg", full=True), 1.0)
+    assert (whole[:, 0] > -edge).any(), "round the foot it goes"
 
 
 @pytest.mark.parametrize("thickness", [0.1, 1.0])
