@@ -47,7 +47,7 @@ CASES = (
     Case("kernel", "kernel integrals", "f64", statics.kernel_integrals),
     Case("momentum", "momentum in a closed box", "f64", statics.momentum),
     Case("shear_wave", "shear wave", "f32", viscosity.shear_wave),
-    Case("viscosity", "viscosity delivered in scenes", "f32", delivered.delivered_viscosity, 16),
+    Case("viscosity", "viscosity delivered in scenes", "f32", delivered.delivered_viscosity, 27),
     Case("taylor_green", "Taylor-Green vortices", "f32", viscosity.taylor_green),
     Case(
         "taylor_green_3d",
