@@ -41,8 +41,8 @@ PRESSURE = 0.05
 aortoiliac has 0.01 to 0.11 rho u_rms^2 in its first 0.15 s by the physics and the implicit model,
 and less than 0.001 later."""
 CLOSED_PRESSURE = 0.3
-"""Mean pressure over the datum in a closed vessel [rho U^2], so 4.8 rho u^2: `aorta_surgery` has 0.3
-to 0.1 rho U^2 over 0.5 s, and 1 to 7 rho u_rms^2 once its flow has risen."""
+"""Mean pressure over the datum in a closed vessel [rho U^2], so 4.8 rho u^2: `aorta_surgery` has
+0.3 to 0.1 rho U^2 over 0.5 s, and 1 to 7 rho u_rms^2 once its flow has risen."""
 CLOSE = 0.25
 """Largest error of the mean pressure."""
 BOXES = 6
