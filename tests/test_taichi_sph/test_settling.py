@@ -77,6 +77,7 @@ def test_a_number_of_particles_is_kept_and_its_depth_follows() -> None:
     assert depth == pytest.approx(count * spacing**3 / opening.area, abs=spacing)
 
 
+@pytest.mark.validation
 def test_the_start_is_kept_and_found_again(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(settling, "CACHE_FROM", 10)

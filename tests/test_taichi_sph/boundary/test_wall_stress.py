@@ -140,6 +140,7 @@ def test_the_file_is_a_surface_with_the_stress_at_its_points(tube, watched) -> N
         assert f'Name="{name}"' in text
 
 
+@pytest.mark.validation
 def test_a_state_that_has_been_watched_is_watched_on(box: Path) -> None:
     scene = read_scene(box / "scene.toml")
     first, second = (Simulation.from_scene(scene) for _ in range(2))
