@@ -42,7 +42,7 @@ from taichi_sph.particles.neighbors import Neighbors
 from taichi_sph.particles.particles import Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
-from taichi_sph.scene import Column, Scene
+from taichi_sph.scene import Scene
 from taichi_sph.settling import Plane, settle
 from taichi_sph.waveform import read_waveform
 
@@ -255,13 +255,8 @@ def _proxies(plan: _Plan, sample: WallSample) -> tuple[Floats, Floats, Floats]:
     return np.concatenate(positions), np.concatenate(normals), np.concatenate(amplitudes)
 
 
-def _lattice(plan: _Plan, proxies: Floats, column: Column, spacing: float) -> Floats:
-    """A lattice in a column (n, 3) [m], less what the proxies and the tool take.
-
-    Raises:
-        InputError: the column does not fit.
-    """
-    places = plan.vessel.fill_column(column, spacing)
+def _clear(plan: _Plan, proxies: Floats, places: Floats, spacing: float) -> Floats:
+    """A lattice (n, 3) [m] of a spacing, less what the proxies and the tool take."""
     places = places[_beside_tool(plan, places, 0.5 * spacing)]
     return places[clear_of_proxies(places, proxies, spacing, plan.calibration.setback)]
 
@@ -283,28 +278,28 @@ def _column(plan: _Plan, proxies: Floats) -> Floats:
     Raises:
         InputError: the column does not fit, or the proxies take all of its places.
     """
-    spacing, column = plan.spacing, plan.scene.column
-    places = _lattice(plan, proxies, column, spacing)
+    spacing, column, vessel = plan.spacing, plan.scene.column, plan.vessel
+    lattice = vessel.fill_column(column, spacing)
+    places = _clear(plan, proxies, lattice, spacing)
     if len(places) == 0:
         raise InputError(
             f"column: no place at {column.opening!r} is far enough from the wall at "
             f"spacing {spacing:g} m; choose a finer spacing"
         )
-    room = plan.vessel.column_room(column, spacing)
-    volume = room.volume
-    if not column.full:
-        # A lattice as deep, whatever its spacing; as many particles may be less than a layer.
+    room = vessel.column_room(column, spacing)
+    if column.particles is not None:
+        # As deep, whatever the lattice's spacing; as many particles may be less than a layer.
         column = msgspec.structs.replace(column, height=max(room.height, spacing), particles=None)
-    if plan.tool is not None:
-        every = plan.vessel.fill_column(column, spacing)
-        volume -= float((~_beside_tool(plan, every, 0.0)).sum()) * spacing**3
-    wanted = round(volume / spacing**3)
-    for _ in range(FILLING_ROUNDS):
-        places = _lattice(plan, proxies, column, spacing)
+        lattice = vessel.fill_column(column, spacing)
+        places = _clear(plan, proxies, lattice, spacing)
+    taken = int((~_beside_tool(plan, lattice, 0.0)).sum())
+    wanted = round(room.volume / spacing**3 - taken)
+    for _ in range(FILLING_ROUNDS - 1):
         if len(places) >= wanted:
             break
         # A little finer than in proportion, for what is cut off at the wall does not shrink alike.
         spacing *= 0.999 * (max(1, len(places)) / wanted) ** (1.0 / 3.0)
+        places = _clear(plan, proxies, vessel.fill_column(column, spacing), spacing)
     kept = np.random.default_rng(0).permutation(len(places))[:wanted]
     return places[np.sort(kept)]
 

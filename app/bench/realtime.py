@@ -49,7 +49,7 @@ class Curve:
 def divided(scene: Scene, particles: int) -> Scene:
     """The scene with its blood in so many particles."""
     spacing, column = scene.discretization.spacing, scene.column
-    count = read_vessel(scene).column_room(column, spacing).volume / spacing**3
+    count = column.particles or read_vessel(scene).column_room(column, spacing).volume / spacing**3
     spacing *= (count / particles) ** (1.0 / 3.0)
     return with_column(varied(scene, None, spacing), particles, None)
 

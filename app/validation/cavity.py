@@ -5,10 +5,8 @@ import math
 import numpy as np
 
 from app.validation import flows
-from app.validation.flows import DENSITY, MACH, VISCOSITY, Liquid, State, state_of
+from app.validation.flows import DENSITY, VISCOSITY, Liquid, State, state_of
 from app.validation.report import Curve, Report, watched
-from taichi_sph.boundary.datum import LEAST_PRESSURE
-from taichi_sph.fluid.rheology import Newtonian
 from taichi_sph.simulation import Simulation
 
 SIDE = 1e-3
@@ -89,10 +87,7 @@ def _sums(state: State, places: np.ndarray, axis: int, across: int) -> np.ndarra
 def make_cavity(across: int, speed: float) -> Simulation:
     """Blood at rest in the square, whose lid slides along x at a speed [m/s]."""
     d = SIDE / across
-    liquid = Liquid(
-        Newtonian(VISCOSITY), MACH * speed, d,
-        background_pressure=LEAST_PRESSURE * DENSITY * speed**2,
-    )  # fmt: skip
+    liquid = Liquid.closed(speed, d)
     setback = liquid.fluid().calibration.setback
     far = SIDE + setback
     count = round((SIDE + 2.0 * setback) / d)

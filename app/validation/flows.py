@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_sph.boundary.boundary import BloodFlow
+from taichi_sph.boundary.datum import LEAST_PRESSURE
 from taichi_sph.fluid.calibration import calibrate
 from taichi_sph.fluid.equation_of_state import Tait
 from taichi_sph.fluid.model import Fluid
@@ -91,6 +92,17 @@ class Liquid:
             make_rheology(blood.rheology), sound_speed, grid.spacing, grid.support_ratio,
             grid.wall_spacing_ratio, artificial_viscosity=blood.artificial_viscosity,
             nested=grid.viscous_form == "nested", courant_number=grid.courant_number,
+        )  # fmt: skip
+
+    @classmethod
+    def closed(cls, speed: float, spacing: float) -> "Liquid":
+        """Newtonian blood at a closed scene's sound speed and pressure, of its largest speed [m/s].
+
+        `spacing` is d [m].
+        """
+        return cls(
+            Newtonian(VISCOSITY), MACH * speed, spacing,
+            background_pressure=LEAST_PRESSURE * DENSITY * speed**2,
         )  # fmt: skip
 
     @property

@@ -11,7 +11,6 @@ import numpy as np
 from app.validation import analytic, flows
 from app.validation.flows import BACKGROUND, DENSITY, MACH, VISCOSITY, Liquid, State, state_of
 from app.validation.report import Curve, Report, relative_l2, watched
-from taichi_sph.boundary.datum import LEAST_PRESSURE
 from taichi_sph.fluid.rheology import Casson, Newtonian
 
 
@@ -122,10 +121,7 @@ def steady_pipe(report: Report, quick: bool) -> None:
     work = [reynolds * across**4 for reynolds, across, *_ in cases]
     for number, (reynolds, across, tolerance, known) in enumerate(cases):
         speed = reynolds * nu / (2.0 * RADIUS)
-        liquid = Liquid(
-            Newtonian(VISCOSITY), MACH * speed, 2.0 * RADIUS / across,
-            background_pressure=LEAST_PRESSURE * DENSITY * speed**2,
-        )  # fmt: skip
+        liquid = Liquid.closed(speed, 2.0 * RADIUS / across)
         motion = flows.tube(liquid, RADIUS, 4.0 * VISCOSITY * speed / RADIUS**2, ordered=False)
         flows.set_velocity(motion, partial(parabola, speed=speed))
         done, all_of_it = sum(work[:number]), sum(work)
@@ -162,6 +158,19 @@ def harmonic(time: np.ndarray, values: np.ndarray, frequency: float) -> complex:
     return complex(real, imaginary)
 
 
+def pulsating_drive(speed: float, frequency: float) -> float:
+    """Amplitude of the drive [Pa/m] that makes a largest speed [m/s] at an angular frequency [1/s].
+
+    Everything is proportional to the drive.
+    """
+    line = np.linspace(0.0, RADIUS, 200)
+    in_phase, behind = (
+        analytic.pipe_pulsation(line, time, RADIUS, 1.0, frequency, VISCOSITY, DENSITY)
+        for time in (0.0, 0.5 * math.pi / frequency)
+    )
+    return speed / float(np.hypot(in_phase, behind).max())
+
+
 def womersley(report: Report, quick: bool) -> None:
     """Pulsating flow in a round tube, from rest: amplitude and phase, and the profile."""
     across, tolerance = (10, 0.1) if quick else (20, 0.05)
@@ -171,12 +180,7 @@ def womersley(report: Report, quick: bool) -> None:
     period = 2.0 * math.pi / frequency
     constants = (frequency, VISCOSITY, DENSITY)
     line = np.linspace(0.0, RADIUS, 200)
-
-    # Everything is proportional to the drive: the one that makes the largest speed U.
-    in_phase, behind = (
-        analytic.pipe_pulsation(line, time, RADIUS, 1.0, *constants) for time in (0.0, period / 4.0)
-    )
-    drive = speed / float(np.hypot(in_phase, behind).max())
+    drive = pulsating_drive(speed, frequency)
 
     def theory(r: np.ndarray, time: float) -> np.ndarray:
         return analytic.pipe_pulsation(r, time, RADIUS, drive, *constants)

@@ -14,12 +14,10 @@ import numpy as np
 import taichi as ti
 
 from app.validation import flows
-from app.validation.flows import DENSITY, MACH, VISCOSITY, Liquid, state_of
+from app.validation.flows import DENSITY, VISCOSITY, Liquid, state_of
 from app.validation.report import Report, watched
 from taichi_sph.boundary.boundary import BloodFlow, Boundary
-from taichi_sph.boundary.datum import LEAST_PRESSURE
 from taichi_sph.fluid.model import AccelerationModel
-from taichi_sph.fluid.rheology import Newtonian
 from taichi_sph.simulation import Simulation
 
 RADIUS = 1e-3
@@ -141,10 +139,7 @@ def bends(report: Report, quick: bool) -> None:
         expected = 0.5 * (white(dean) + ito(dean))
         drive = expected * 8.0 * VISCOSITY * mean / RADIUS**2
         largest = 2.0 * mean
-        liquid = Liquid(
-            Newtonian(VISCOSITY), MACH * largest, 2.0 * RADIUS / across,
-            background_pressure=LEAST_PRESSURE * DENSITY * largest**2,
-        )  # fmt: skip
+        liquid = Liquid.closed(largest, 2.0 * RADIUS / across)
         motion = torus(liquid, RADIUS, bend, drive)
 
         def parabola(x: np.ndarray, speed: float = largest) -> np.ndarray:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from app.validation import analytic, flows
-from app.validation.flows import DENSITY, MACH, VISCOSITY, Liquid
+from app.validation.flows import DENSITY, VISCOSITY, Liquid
 from app.validation.pipes import (
     PHASES,
     PULSES,
@@ -14,11 +14,10 @@ from app.validation.pipes import (
     WOMERSLEY,
     harmonic,
     parabola,
+    pulsating_drive,
 )
 from app.validation.report import Report, relative_l2, watched
-from taichi_sph.boundary.datum import LEAST_PRESSURE
 from taichi_sph.boundary.wall_stress import WallStress
-from taichi_sph.fluid.rheology import Newtonian
 from taichi_sph.simulation import Simulation
 
 REYNOLDS = 100
@@ -40,10 +39,7 @@ def watch_wall(motion: Simulation) -> WallStress:
 
 def driven_tube(across: int, speed: float, drive: float) -> Simulation:
     """Disordered blood in a tube, at a closed scene's pressure and sound speed."""
-    liquid = Liquid(
-        Newtonian(VISCOSITY), MACH * speed, 2.0 * RADIUS / across,
-        background_pressure=LEAST_PRESSURE * DENSITY * speed**2,
-    )  # fmt: skip
+    liquid = Liquid.closed(speed, 2.0 * RADIUS / across)
     return flows.tube(liquid, RADIUS, drive, ordered=False)
 
 
@@ -82,13 +78,8 @@ def _pulse(report: Report, across: int) -> None:
     nu = VISCOSITY / DENSITY
     frequency = nu * (WOMERSLEY / RADIUS) ** 2
     period = 2.0 * math.pi / frequency
-    constants = (frequency, VISCOSITY, DENSITY)
     speed = REYNOLDS * nu / (2.0 * RADIUS)
-    line = np.linspace(0.0, RADIUS, 200)
-    in_phase, behind = (
-        analytic.pipe_pulsation(line, time, RADIUS, 1.0, *constants) for time in (0.0, period / 4.0)
-    )
-    drive = speed / float(np.hypot(in_phase, behind).max())
+    drive = pulsating_drive(speed, frequency)
     motion = driven_tube(across, speed, drive)
     measured = watch_wall(motion)
     times = [(k + 1) / PHASES * period for k in range(PULSES * PHASES)]
@@ -101,7 +92,7 @@ def _pulse(report: Report, across: int) -> None:
     # Each is the average of the time before its own: half of it earlier.
     middle = np.array(times[-PHASES:]) - 0.5 * period / PHASES
     found = harmonic(middle, np.array(stress[-PHASES:]), frequency)
-    exact = analytic.pipe_pulsation_wall_stress(RADIUS, drive, *constants)
+    exact = analytic.pipe_pulsation_wall_stress(RADIUS, drive, frequency, VISCOSITY, DENSITY)
     where = f"Womersley, Wo {WOMERSLEY:g}, Re {REYNOLDS}, {across} across, disordered"
     report.compare(
         f"{where}: amplitude of the wall shear stress", abs(found), abs(exact), 0.05, "Pa"

@@ -59,7 +59,7 @@ def test_it_is_still_even_and_below_its_opening(coarse: Simulation, precision: s
     assert coarse.vessel.contains(x).all()
     coarse.step(INSTANT)
     ratio = coarse.particles.density.to_numpy()[: len(x)] / coarse.scene.blood.density
-    assert np.percentile(ratio, 99.5) <= 1.0
+    assert np.percentile(ratio, 99.5) < 0.999
     # Half of so coarse a column is beside its ends.
     assert np.median(ratio) > 0.97
     # Without pressure it only falls.

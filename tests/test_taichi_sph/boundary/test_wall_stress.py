@@ -64,7 +64,7 @@ def test_the_friction_is_what_the_drive_gives_and_blood_does_not_keep(
     given = DRIVE / DENSITY * time * tube.particles.mass * tube.particles.count[None]
     sums = watched.impulse, watched.artificial_impulse
     taken = sum(field.to_numpy()[:, 2].astype(float).sum() for field in sums)
-    # Proxies are no smooth wall: their pressure holds blood back too, some thousandths here.
+    # Proxies are no smooth wall: their pressure acts along it too, some thousandths here.
     assert taken == pytest.approx(given - (momentum(tube) - before), rel=0.005)
     assert 0.01 * given < taken < given
 
@@ -74,22 +74,17 @@ def test_the_stress_is_along_the_wall_and_everywhere_the_same(
 ) -> None:
     slide(tube, SPEED)
     tube.step(1e-9)
+    force = watched.impulse.to_numpy()[:, 2].astype(float).sum() / 1e-9
     stress = watched.look()
     area = 2.0 * math.pi * RADIUS * flows.SLAB * 2.0 * RADIUS / ACROSS
-    force = watched.impulse.to_numpy()[:, 2].sum()
-    assert force == 0.0, "a look begins anew"
+    assert not watched.impulse.to_numpy().any(), "a look begins anew"
     # In flow that slips uniformly; rings of blood are not even along the wall.
     assert np.abs(np.einsum("ka,ka->k", stress, watched.normals)).max() < 1e-6 * stress[:, 2].max()
     assert stress[:, 2].std() < 0.15 * stress[:, 2].mean()
     assert watched.result().mean[:, 2].mean() == pytest.approx(stress[:, 2].mean(), rel=1e-12)
-    spread = np.asarray(watched._spread.sum(axis=0)).ravel()
-    assert spread.sum() > 0.0
     total = float((stress[:, 2] * area / len(stress)).sum())
-    coefficients = tube.model.pair_coefficients
-    assert coefficients is not None
-    mu = coefficients[2].to_numpy()[0]
-    # Some 2 mu U/(d/2): as a layer that stands half a spacing off.
-    assert total == pytest.approx(area * 2.0 * mu * SPEED / (2.0 * RADIUS / ACROSS), rel=0.5)
+    # Places are spread evenly; what a proxy stands for is some 4 % too little in so narrow a tube.
+    assert total == pytest.approx(force, rel=0.06)
 
 
 def test_averages_of_a_stress_that_turns(tube: Simulation, watched: WallStress) -> None:
