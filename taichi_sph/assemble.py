@@ -39,7 +39,7 @@ from taichi_sph.geometry.vessel import Vessel
 from taichi_sph.geometry.wall_sampling import WallSample
 from taichi_sph.particles.grid import cells_within, make_grid
 from taichi_sph.particles.neighbors import Neighbors
-from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.particles import LOCAL_DATUM, Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
 from taichi_sph.scene import Scene
@@ -157,7 +157,7 @@ def assemble(scene: Scene, vessel: Vessel, seed: int = 0) -> Assembly:
     fluid = _make_fluid(plan, derived)
     particles = Particles.from_numpy(
         initial, mass=scene.blood.density * plan.spacing**3, room=_room(plan, len(initial)),
-        more=(DYE, AGE),
+        more=(DYE, AGE, *(() if derived.quiet_speed is None else (LOCAL_DATUM,))),
     )  # fmt: skip
     wall = Wall.from_numpy(
         start.proxies, start.normals, plan.kernel, start.setback, plan.wall_spacing,

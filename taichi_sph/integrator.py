@@ -57,6 +57,7 @@ def kick_drift(
     inflow: ti.template(),
     as_printed: ti.template(),
     dt: float,
+    datum_share: float,
 ) -> ti.math.vec2:
     """Advance velocity and position by dt [s], then keep blood inside the wall.
 
@@ -70,11 +71,12 @@ def kick_drift(
     this holds a lone droplet, which has no pressure.
 
     Blood in a buffer of `inflow` (the `BufferZones`, or None) moves with it, and no wall stops it;
-    none is shifted within a support radius of a buffer.
+    none is shifted within a support radius of a buffer.  `datum_share` of the mean pressure is
+    the local datum of the next step (`taichi_sph.fluid.local_datum`), none in a buffer.
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.
-    Reads: acceleration, shifting, wall, lists.  Writes: velocity, position.
+    Reads: acceleration, shifting, wall, lists.  Writes: velocity, position, local_datum.
     """
     moved2 = 0.0
     corrected = 0.0
@@ -93,9 +95,13 @@ def kick_drift(
         else:
             x += (v_new + shifting) * dt
         walls = nb.wall_count[i]
+        if ti.static(p.has_local_datum):
+            p.local_datum[i] = datum_share * p.mean_pressure_term[i]
         if ti.static(has_buffers(inflow)):
             buffer = inflow.regions.buffer_at(x_old)
             if buffer >= 0:
+                if ti.static(p.has_local_datum):
+                    p.local_datum[i] = 0.0  # what acts on a buffer is the whole pressure
                 v_new = inflow.speed[buffer] * inflow.regions.inward_normal(buffer)
                 x = x_old + v_new * dt
                 walls = 0

@@ -135,7 +135,7 @@ def _let_go(blood: BloodFlow, model: SphAcceleration, inflow: Any, top: Plane) -
             neighbors.build(particles, wall)
         model.accelerate(particles, wall, neighbors, (0.0, 0.0, 0.0))
         bound_acceleration(particles, MOST_MOVED * fluid.spacing / (dt * dt))
-        moved2, _ = kick_drift(particles, wall, neighbors, inflow, False, dt)
+        moved2, _ = kick_drift(particles, wall, neighbors, inflow, False, dt, 0.0)
         slow(particles, KEPT, *top.point, *top.normal)
         neighbors.note_drift(float(moved2) ** 0.5, 0.0)
     return np.asarray(particles.in_order(particles.position), float)

@@ -119,7 +119,9 @@ class Simulation:
         self._accelerate(self.model)
         dt = self._choose_step(remaining)
         wall_moved = sum(b.before_drift(dt, self.model) for b in self.boundaries)
-        blood_moved2, corrected = kick_drift(p, w, nb, self._inflow, self.as_printed, dt)
+        blood_moved2, corrected = kick_drift(
+            p, w, nb, self._inflow, self.as_printed, dt, self.blood.local_share
+        )
         nb.note_drift(math.sqrt(blood_moved2), wall_moved)
         self._count_step(dt, int(corrected))
 

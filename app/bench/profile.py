@@ -172,7 +172,7 @@ def measure_passes(
             p, w, nb, implicit.fluid, implicit.interval, implicit.diagonal, implicit.pressure_term
         ),
         "survey": lambda: largest_speed_and_acceleration(p),
-        "integration, wall": lambda: kick_drift(p, w, nb, None, False, 0.0),
+        "integration, wall": lambda: kick_drift(p, w, nb, None, False, 0.0, 0.0),
         "limit of arithmetic": lambda: multiply_add(numbers, sums),
         "limit of fetching": lambda: fetch(p, nb, sums),
     })  # fmt: skip

@@ -5,12 +5,13 @@ openings.  The tables are in millimetres, as measured; surfaces come out in metr
 """
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from app.scenes.branching import branching, cap_all
-from app.scenes.vessel_table import Box, Shape, Tube, read_shape
+from app.scenes.vessel_table import Box, Revolved, Shape, Tube, read_shape
 from taichi_sph.geometry import mesh
 from taichi_sph.geometry.mesh import Floats, Integers
 
@@ -18,7 +19,9 @@ from taichi_sph.geometry.mesh import Floats, Integers
 def make_surface(shape: Shape) -> tuple[Floats, Integers]:
     """Generate a closed surface: vertices (n, 3) [m] and outward triangles (m, 3)."""
     if isinstance(shape, Tube):
-        vertices, faces = _revolve(shape)
+        vertices, faces = _revolve(*_tube(shape), shape.segments, shape.name)
+    elif isinstance(shape, Revolved):
+        vertices, faces = _revolve(*_profile(shape), shape.segments, shape.name)
     elif isinstance(shape, Box):
         vertices, faces = _tank(shape)
     else:
@@ -45,14 +48,32 @@ def remake(folder: Path) -> tuple[int, float]:
 # Plain shapes
 
 
-def _revolve(tube: Tube) -> tuple[Floats, Integers]:
-    count = tube.segments
-    step = 2 * math.pi * tube.radius / count
+def _tube(tube: Tube) -> tuple[Floats, Floats]:
+    """Height and radius of each ring [mm], (n,) each."""
+    step = 2 * math.pi * tube.radius / tube.segments
     rings = 2 * math.ceil(tube.length / step / 2) + 1
     z = np.linspace(-0.5, 0.5, rings) * tube.length
     wave = 0.5 * (1.0 + np.cos(2 * np.pi * z / tube.throat_length))
     wave[np.abs(z) > 0.5 * tube.throat_length] = 0.0
-    radius = tube.radius * (1.0 - 0.01 * tube.narrowing * wave)
+    return z, tube.radius * (1.0 - 0.01 * tube.narrowing * wave)
+
+
+def _profile(shape: Revolved) -> tuple[Floats, Floats]:
+    """Height and radius of each ring [mm], (n,) each: corners, and rings evenly between them."""
+    corners = np.array(shape.profile)
+    step = 2 * math.pi * corners[:, 1].max() / shape.segments
+    rings = [corners[:1]]
+    for start, stop in pairwise(corners):
+        count = math.ceil(float(np.linalg.norm(stop - start)) / step)
+        share = np.arange(1, count + 1)[:, None] / count
+        rings.append(start + share * (stop - start))
+    z, radius = np.concatenate(rings).T
+    return z, radius
+
+
+def _revolve(z: Floats, radius: Floats, count: int, name: str) -> tuple[Floats, Integers]:
+    """Rings of `count` vertices, capped: vertices (n, 3), triangles (m, 3)."""
+    rings = len(z)
     # Every other ring is turned by half a segment, which makes the triangles even.
     angle = 2 * np.pi / count * (np.arange(count) + 0.5 * (np.arange(rings)[:, None] % 2))
     vertices = np.stack(
@@ -68,7 +89,7 @@ def _revolve(tube: Tube) -> tuple[Floats, Integers]:
             faces += [np.stack([a, an, b], 1), np.stack([an, bn, b], 1)]
         else:
             faces += [np.stack([a, an, bn], 1), np.stack([a, bn, b], 1)]
-    return cap_all(vertices, np.concatenate(faces), tube.name)
+    return cap_all(vertices, np.concatenate(faces), name)
 
 
 def _tank(box: Box) -> tuple[Floats, Integers]:

@@ -3,6 +3,7 @@
 The tables are in millimetres, as measured.
 """
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Union
 
@@ -83,6 +84,27 @@ class Tube(_Table, tag_field="shape", tag="tube"):
     units: Literal["mm"] = "mm"
 
 
+class Revolved(_Table, tag_field="shape", tag="revolved"):
+    """A straight round tube about z whose radius is given along it."""
+
+    name: str
+    profile: Annotated[list[tuple[float, Positive]], msgspec.Meta(min_length=2)]
+    """z and radius [mm] of the corners, by rising z; two at one z are a step."""
+    segments: Annotated[int, msgspec.Meta(ge=8)] = 72
+    """Vertices round the tube."""
+    units: Literal["mm"] = "mm"
+
+    def __post_init__(self) -> None:
+        """Refuse a profile that turns back.
+
+        Raises:
+            ValueError: it does, or it is closed at an end.
+        """
+        z = [corner[0] for corner in self.profile]
+        if any(after < before for before, after in pairwise(z)) or z[0] == z[1] or z[-1] == z[-2]:
+            raise ValueError("profile: z must rise from corner to corner, and may stay but between")
+
+
 class Box(_Table, tag_field="shape", tag="box"):
     """A rectangular tank about the origin."""
 
@@ -92,7 +114,7 @@ class Box(_Table, tag_field="shape", tag="box"):
     units: Literal["mm"] = "mm"
 
 
-Shape = Union[Centrelines, Tube, Box]
+Shape = Union[Centrelines, Tube, Revolved, Box]
 
 
 def read_shape(path: Path) -> Shape:

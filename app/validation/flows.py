@@ -14,14 +14,16 @@ from scipy.spatial import cKDTree
 
 from taichi_sph.boundary.boundary import BloodFlow
 from taichi_sph.boundary.datum import LEAST_PRESSURE
+from taichi_sph.derived import is_closed
 from taichi_sph.fluid.calibration import calibrate
 from taichi_sph.fluid.equation_of_state import Tait
+from taichi_sph.fluid.local_datum import LOCAL_SHARE
 from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import Casson, Newtonian, make_rheology
 from taichi_sph.fluid.wcsph import SphAcceleration
 from taichi_sph.particles.grid import make_grid
 from taichi_sph.particles.neighbors import Neighbors
-from taichi_sph.particles.particles import Particles
+from taichi_sph.particles.particles import LOCAL_DATUM, Particles
 from taichi_sph.particles.smoothing_kernel import WendlandC2
 from taichi_sph.particles.wall import Wall
 from taichi_sph.runtime import float_dtype
@@ -77,6 +79,8 @@ class Liquid:
     wall_spacing_ratio: float = 1.0
     background_pressure: float = 0.0
     """[Pa], for flows without a free surface."""
+    local_datum: bool = False
+    """Whether pressure has one (`taichi_sph.fluid.local_datum`), as in a closed scene."""
     artificial_viscosity: float = 0.0
     """Monaghan's alpha [-]."""
     nested: bool = False
@@ -92,6 +96,7 @@ class Liquid:
             make_rheology(blood.rheology), sound_speed, grid.spacing, grid.support_ratio,
             grid.wall_spacing_ratio, artificial_viscosity=blood.artificial_viscosity,
             nested=grid.viscous_form == "nested", courant_number=grid.courant_number,
+            local_datum=is_closed(scene),
         )  # fmt: skip
 
     @classmethod
@@ -102,7 +107,7 @@ class Liquid:
         """
         return cls(
             Newtonian(VISCOSITY), MACH * speed, spacing,
-            background_pressure=LEAST_PRESSURE * DENSITY * speed**2,
+            background_pressure=LEAST_PRESSURE * DENSITY * speed**2, local_datum=True,
         )  # fmt: skip
 
     @property
@@ -185,8 +190,10 @@ def make_simulation(
         liquid.spacing,
         wall,
     )
-    particles = Particles.from_numpy(position, velocity, DENSITY * liquid.spacing**3)
-    blood = BloodFlow(particles, wall, neighbors, body_force)
+    more = (LOCAL_DATUM,) if liquid.local_datum else ()
+    particles = Particles.from_numpy(position, velocity, DENSITY * liquid.spacing**3, more=more)
+    share = LOCAL_SHARE if liquid.local_datum else 0.0
+    blood = BloodFlow(particles, wall, neighbors, body_force, local_share=share)
     if wall_velocity is not None:
         rows = cKDTree(wall_position).query(wall.position.to_numpy()[: wall.count])[1]
         wall.velocity.from_numpy(wall_velocity[rows].astype(float_dtype()))
@@ -394,14 +401,15 @@ def settle(simulation: Simulation, steps: int = 500) -> None:
 
     Velocities are set to zero at every step at first (overlaps push hard), then at every fifth.
     """
-    force, limit = simulation.gravity, simulation.speed_limit
-    simulation.gravity, simulation.speed_limit = (0.0, 0.0, 0.0), math.inf
+    blood = simulation.blood
+    force, limit, share = simulation.gravity, simulation.speed_limit, blood.local_share
+    simulation.gravity, simulation.speed_limit, blood.local_share = (0.0, 0.0, 0.0), math.inf, 0.0
     for k in range(steps):
         simulation.step(FAR)
         if k < steps // 5 or k % 5 == 4:
             simulation.particles.velocity.fill(0.0)
     simulation.particles.velocity.fill(0.0)
-    simulation.gravity, simulation.speed_limit = force, limit
+    simulation.gravity, simulation.speed_limit, blood.local_share = force, limit, share
     simulation.time, simulation.steps, simulation.wall_corrections = 0.0, 0, 0
 
 

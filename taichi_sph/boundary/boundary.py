@@ -86,6 +86,9 @@ class BloodFlow:
     """What pressure is measured from now."""
     largest_speed: float = 0.0
     """Of blood in the last step [m/s]."""
+    local_share: float = 0.0
+    """Part of the pressure about a particle that its own is measured from, of particles that have a
+    local datum (`taichi_sph.fluid.local_datum`)."""
 
     @property
     def felt_gravity(self) -> tuple[float, float, float]:

@@ -27,6 +27,7 @@ from taichi_sph.fluid.forces import (
     pair_viscosity,
     wall_pair_acceleration,
 )
+from taichi_sph.fluid.local_datum import local_datum
 from taichi_sph.fluid.model import Fluid
 from taichi_sph.fluid.rheology import shear_rate
 from taichi_sph.fluid.shifting import shifting_velocity
@@ -174,23 +175,25 @@ def sum_acceleration(
     """Acceleration of each particle (Eq. 5): `taichi_sph.fluid.forces` has each term.
 
     Blood:
-        a_ij = -m (p_i/rho_i^2 + p_j/rho_j^2 + Pi_ij) grad W_ij
+        a_ij = -m (p_i/rho_i^2 + p_j/rho_j^2 - 2 D_i + Pi_ij) grad W_ij
                + m 2 mu_ij/(rho_i rho_j) (r_ij.grad W_ij)/(r_ij^2 + eps) v_ij
     Wall:
-        a_ik = -gamma rho_0 V_k (p_i/rho_i^2 + Pi_ik) grad W_ik
+        a_ik = -gamma rho_0 V_k (p_i/rho_i^2 - D_i + Pi_ik) grad W_ik
                + gamma_mu rho_0 F_k V_k 2 mu_i/rho_i^2 (r_ik.grad W_ik)/(r_ik^2 + eps) v_ik
 
     | symbol | code | meaning | unit |
     |---|---|---|---|
     | m, rho_0 | mass, fluid.rest_density | mass in the sums, rest density | kg, kg/m^3 |
     | p_i/rho_i^2 | p_i, pressure_term | pressure term | m^5/(kg s^2) |
+    | D_i | datum | of particles that have it, see `local_datum` | m^5/(kg s^2) |
     | Pi_ij | | artificial viscosity, part of `pressure` | m^5/(kg s^2) |
     | mu_i, mu_ij | mu_i, mu_ij | viscosity, of a pair with its calibration and a factor 2 | Pa s |
     | gamma, gamma_mu | calibration.wall_density, wall_friction | of Eq. 3 | 1 |
     | F_k | w.friction | where the wall is curved | 1 |
     | a_i | a_i, a_wall | by blood, by the wall | m/s^2 |
 
-    Reads: position, velocity, density, scratch.  Writes: acceleration.
+    Reads: position, velocity, density, local_datum, scratch.
+    Writes: acceleration, mean_pressure_term.
     """
     mass = ti.static(fluid.calibration.mass)
     for i in range(p.count[None]):
@@ -199,6 +202,9 @@ def sum_acceleration(
         rho_i = p.density[i]
         p_i = pressure_term[i]
         mu_i = viscosity[i]
+        datum = local_datum(fluid, p, i)
+        weight = fluid.kernel.w(0.0)
+        mean = weight * p_i
         a_i = ti.Vector([0.0, 0.0, 0.0])
         for n in range(nb.blood_count[i]):
             j = nb.blood_index[i, n]
@@ -208,7 +214,12 @@ def sum_acceleration(
             slope = fluid.kernel.slope(ti.sqrt(r2))
             v_ij = v_i - p.velocity[j]
             rho_j = p.density[j]
-            pressure = pair_pressure(fluid, p_i, pressure_term[j])
+            p_j = pressure_term[j]
+            pressure = pair_pressure(fluid, p_i - 2.0 * datum, p_j)
+            if ti.static(p.has_local_datum):
+                w_ij = fluid.kernel.w(ti.sqrt(r2))
+                weight += w_ij
+                mean += w_ij * p_j
             if ti.static(fluid.has_artificial_viscosity):
                 alpha = artificial_factor(fluid, sound_speed, 0.5 * (rho_i + rho_j))
                 pressure += pair_artificial_viscosity(alpha, r_ij, v_ij, softened, rho_i + rho_j)
@@ -219,12 +230,16 @@ def sum_acceleration(
                 mu_ij = mean_viscosity(fluid, mu_i, viscosity[j])
                 mu_ij *= ti.static(2.0 * fluid.calibration.viscosity)
                 a_i += pair_viscosity(mu_ij, slope, r2, softened, rho_i, rho_j) * v_ij
+        if ti.static(p.has_local_datum):
+            p.mean_pressure_term[i] = mean / weight
         a_i *= mass
         a_wall = ti.Vector([0.0, 0.0, 0.0])
         for n in range(nb.wall_count[i]):
             k = nb.wall_index[i, n]
             r_ik = nb.grid.separation(x_i, w.position[k])
-            a_wall += wall_pair_acceleration(w, k, r_ik, v_i, rho_i, p_i, mu_i, fluid, sound_speed)
+            a_wall += wall_pair_acceleration(
+                w, k, r_ik, v_i, rho_i, p_i - datum, mu_i, fluid, sound_speed
+            )
         a_wall *= ti.static(fluid.rest_density)
         # A vector as an argument would cost 0.05 ms a launch.
         p.acceleration[i] = a_i + a_wall + ti.Vector([g_x, g_y, g_z])

@@ -34,6 +34,9 @@ QUANTITIES = (
     Quantity("density"),
 )
 """What every particle has; more follow after these."""
+LOCAL_DATUM = Quantity("local_datum")
+"""Part of the pressure term p/rho^2 of the neighbourhood in the last step [m^5/(kg s^2)], see
+`taichi_sph.fluid.local_datum`."""
 
 
 class Particles:
@@ -75,6 +78,10 @@ class Particles:
         for quantity, field in zip(self.quantities, self.fields, strict=True):
             setattr(self, quantity.name, field)
         self.shifting = ti.Vector.field(3, float, capacity)
+        self.has_local_datum = LOCAL_DATUM in self.quantities
+        if self.has_local_datum:
+            self.mean_pressure_term = ti.field(float, capacity)
+            """Mean of p/rho^2 over the neighbourhood in this step, likewise [m^5/(kg s^2)]."""
         # A sort copies all rows but positions, which the lists hold, through these.
         moved = [k for k, q in enumerate(self.quantities) if q.name != "position"]
         self.sorted_fields = tuple(self.fields[k] for k in moved)

@@ -50,7 +50,7 @@ def one_step_map(printed: bool, w: float) -> np.ndarray:
     acceleration[:2] = spring(stage.particles.position.to_numpy()[:2].astype(float))
     stage.particles.acceleration.from_numpy(acceleration)
     stage.particles.shifting.fill(0.0)
-    kick_drift(stage.particles, stage.wall, stage.neighbors, None, printed, dt)
+    kick_drift(stage.particles, stage.wall, stage.neighbors, None, printed, dt, 0.0)
     after_x = (stage.in_order(stage.particles.position) - MIDDLE) / small
     after_v = stage.in_order(stage.particles.velocity) / (OMEGA * small)
     return np.stack([after_x, after_v], axis=1)
@@ -140,7 +140,7 @@ def test_blood_that_leaves_a_period_comes_in_again_on_the_other_side():
         stage.in_order(stage.particles.position)[0], expected, atol=SURFACE[precision()] * D, rtol=0
     )
     # How far it has moved since the lists were built is told across the period's end.
-    moved2, _ = kick_drift(stage.particles, stage.wall, stage.neighbors, None, False, 0.0)
+    moved2, _ = kick_drift(stage.particles, stage.wall, stage.neighbors, None, False, 0.0, 0.0)
     assert np.sqrt(moved2) == pytest.approx(np.hypot(0.2, 0.2) * D, rel=1e-4)
 
 

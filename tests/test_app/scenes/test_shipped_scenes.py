@@ -62,7 +62,8 @@ def test_info_tells_how_viscous_the_blood_of_a_shipped_scene_is_and_of_no_other(
         found = delivered_viscosity(find_scene(name))
         assert found is not None
         for model in MODELS:
-            assert f"({model})" in found, name
+            refused = model == "pcnet" and name == "fda_nozzle"  # the weights are of Casson blood
+            assert (f"({model})" in found) != refused, name
     scene = find_scene("box")
     assert delivered_viscosity(msgspec.structs.replace(scene, text=scene.text + "\n")) is None
     assert delivered_viscosity(msgspec.structs.replace(scene, name="mine")) is None

@@ -16,6 +16,7 @@ from taichi_sph.boundary.datum import (
 )
 from taichi_sph.boundary.wounds import Wound
 from taichi_sph.derived import is_closed
+from taichi_sph.fluid.local_datum import LOCAL_SHARE
 from taichi_sph.simulation import Simulation
 
 STEPS = 25
@@ -116,11 +117,13 @@ def test_a_wound_feels_the_whole_pressure_until_it_is_closed(sim):
     assert sim.blood.datum.share == 0.0
     assert sim.blood.datum.value == 0.0
     assert sim.blood.felt_gravity == sim.gravity
+    assert sim.blood.local_share == 0.0
     assert sim.blood.sound_speed == pytest.approx(sim.derived.sound_speed, rel=0.02)
     assert sim.diagnostics().bled_volume > 0.0
     sim.wounds.close()
     sim.advance_to(0.002 + 3.7 * CHANGE_TIME)
     assert sim.blood.datum.share == 1.0
+    assert sim.blood.local_share == LOCAL_SHARE
 
 
 def test_a_vessel_with_an_open_end_has_no_datum(driven):
