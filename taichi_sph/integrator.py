@@ -72,7 +72,7 @@ def kick_drift(
 
     Blood in a buffer of `inflow` (the `BufferZones`, or None) moves with it, and no wall stops it;
     none is shifted within a support radius of a buffer.  `datum_share` of the mean pressure is
-    the local datum of the next step (`taichi_sph.fluid.local_datum`), none in a buffer.
+    the local datum of the next step (`taichi_sph.fluid.local_datum`), but nothing there either.
 
     Returns the largest squared distance from where the lists were built [m^2] and the number of
     particles put back.
@@ -84,10 +84,17 @@ def kick_drift(
         v = p.velocity[i]
         v_new = v + p.acceleration[i] * dt
         shifting = p.shifting[i]
+        share = datum_share
         if ti.static(has_buffers(inflow)):
             # The rows of a buffer end at its rim: blood would be shifted back into the gap.
             beside = inflow.regions.buffer_at(p.position[i], nb.support_radius) >= 0
-            shifting *= ti.select(beside, 0.0, 1.0)
+            if beside:
+                shifting *= 0.0
+                # What acts on a buffer is the whole pressure, and what is not kept even by shifting
+                # needs it beside a body that does not give way.
+                share = 0.0
+        if ti.static(p.has_local_datum):
+            p.local_datum[i] = share * p.mean_pressure_term[i]
         x = p.position[i]
         x_old = x
         if ti.static(as_printed):
@@ -95,13 +102,9 @@ def kick_drift(
         else:
             x += (v_new + shifting) * dt
         walls = nb.wall_count[i]
-        if ti.static(p.has_local_datum):
-            p.local_datum[i] = datum_share * p.mean_pressure_term[i]
         if ti.static(has_buffers(inflow)):
             buffer = inflow.regions.buffer_at(x_old)
             if buffer >= 0:
-                if ti.static(p.has_local_datum):
-                    p.local_datum[i] = 0.0  # what acts on a buffer is the whole pressure
                 v_new = inflow.speed[buffer] * inflow.regions.inward_normal(buffer)
                 x = x_old + v_new * dt
                 walls = 0

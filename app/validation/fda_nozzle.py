@@ -65,7 +65,7 @@ HALF = 1.0
 """A profile is of blood within so many spacings of its z."""
 SIDES = 4
 """Quarters of a section that are held against each other."""
-ENDS, AVERAGED = 0.65, 0.15
+ENDS, AVERAGED = 0.5, 0.1
 """The run ends at a time, of which it is averaged over the last part [s]."""
 LOOK = 0.005
 """Time between two looks [s]."""

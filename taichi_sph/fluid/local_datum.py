@@ -13,7 +13,8 @@ V grad W_ij is zero; the differences of pressure stay, and so does q - Q, which 
 apart.  (Difference forms do alike: Sun et al. 2017, doi:10.1016/j.cma.2016.10.028, under tension.)
 Pairs no longer conserve momentum exactly, so it serves where a wall takes it: in closed scenes
 (`taichi_sph.boundary.datum`) while no wound is open, and not in the buffers of driven openings, on
-which the whole pressure acts.
+which the whole pressure acts, nor within a support radius of them: blood that is not shifted there
+clumped before the buffer.
 
 | symbol | here | meaning | unit |
 |---|---|---|---|
