@@ -61,7 +61,7 @@ class Tool(Boundary):
             quaternion = finite_numbers("tool: rotation", rotation, (4,))
             if not quaternion.any():
                 raise InputError("tool: a quaternion of length 0 is no rotation")
-            self.target_rotation = Rotation.from_quat(np.roll(quaternion, -1))
+            self.target_rotation = kept_in_states(Rotation.from_quat(np.roll(quaternion, -1)))
         self.target_position = target
 
     def take_force(self) -> Floats:
@@ -148,7 +148,7 @@ class Tool(Boundary):
         """Move by a step of dt [s]; returns how far a part of it may have gone [m]."""
         self.position = self.position + dt * self.velocity
         if self.spin.any():
-            self.rotation = Rotation.from_rotvec(dt * self.spin) * self.rotation
+            self.rotation = kept_in_states(Rotation.from_rotvec(dt * self.spin) * self.rotation)
         assert self.surface is not None
         return dt * (math.hypot(*self.velocity) + self.surface.radius * math.hypot(*self.spin))
 
@@ -206,3 +206,16 @@ class Tool(Boundary):
         self.target_rotation = Rotation.from_quat(rows["target_rotation"])
         self.velocity, self.spin = rows["velocity"], rows["spin"]
         self.write_proxies()
+
+
+def kept_in_states(rotation: Rotation) -> Rotation:
+    """The rotation as it comes back from its quaternion, in which a state keeps it, bit by bit.
+
+    A quaternion is brought to length 1 when it is read, which may turn its last digit.
+    """
+    for _ in range(8):
+        again = Rotation.from_quat(rotation.as_quat())
+        if np.array_equal(again.as_quat(), rotation.as_quat()):
+            break
+        rotation = again
+    return rotation

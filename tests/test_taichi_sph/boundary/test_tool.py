@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from builders import CAPACITY, SKIN, D, Prescribed, R, Setup, precision
 from reference import separations
-from taichi_sph.boundary.tool import LARGEST_SPEED, RESPONSE_TIME, Tool
+from taichi_sph.boundary.tool import LARGEST_SPEED, RESPONSE_TIME, Tool, kept_in_states
 from taichi_sph.boundary.tool_surface import ToolSurface
 from taichi_sph.fluid.model import AccelerationModel
 from tool_stage import AT, BALL, ROUNDING, TURN, hold, proxies
@@ -183,3 +183,21 @@ def test_a_tool_without_a_surface_is_at_once_at_its_target(stage):
     assert tool.position.tolist() == [1.0, 2.0, 3.0]
     assert not tool.arrived
     assert tool.teleport() == 0.0
+
+
+def test_a_turned_tool_comes_back_from_its_quaternion_bit_by_bit():
+    generator = np.random.default_rng(0)
+    turns = [Rotation.from_rotvec(1e-3 * generator.normal(size=3)) for _ in range(2000)]
+
+    def read_back(rotation: Rotation) -> bool:
+        saved = rotation.as_quat().tolist()
+        return Rotation.from_quat(np.array(saved)).as_quat().tolist() == saved
+
+    plain = kept = Rotation.identity()
+    survived = []
+    for turn in turns:
+        plain, kept = turn * plain, kept_in_states(turn * kept)
+        survived.append(read_back(plain))
+        assert read_back(kept)
+    assert not all(survived)  # the length of a product is 1 but for its last digit
+    assert (plain * kept.inv()).magnitude() < 1e-12
