@@ -41,8 +41,8 @@ from taichi_sph.fluid.model import AccelerationModel
 
 LEAST_PRESSURE = 0.1
 """m: with 0.1, 0.2 and 0.3 the blood of `aorta_surgery` is compressed by at most 2.8, 3.9 and
-5.0 %, and a level that blood has to be compressed to drives it in at the start.  (Behind a throat pressure
-is some 0.15 rho U^2 below the outlet's, as measured in the FDA's nozzle: there a little tears.)"""
+5.0 %, and a level that blood has to be compressed to drives it in at the start.  (Behind a throat
+pressure is some 0.15 rho U^2 below the outlet's, as measured in the FDA's nozzle: some tears.)"""
 CHANGE_TIME = 0.01
 """Time in which D is taken back, or comes back [s]: sound crosses a vessel of 0.1 m meanwhile."""
 RISE_TIME, FALL_TIME = 0.005, 0.05
