@@ -11,7 +11,9 @@ z = 0 is the expansion.
 The run keeps its state in the cache every few minutes and goes on from there when it was stopped.
 """
 
+import contextlib
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from app import version
+from app.files import console
 from app.run.checkpoint import Checkpoint
 from app.scenes.library import find_scene, varied
 from app.validation import flows
@@ -184,9 +187,9 @@ def half_width(profile: Floats, axis: float) -> float:
     return 2.0 * float(r[below - 1] + share * (r[below] - r[below - 1]))
 
 
-def _facts(scene: Scene) -> dict[str, Any]:
+def _facts(scene: Scene, ends: float, averaged: float) -> dict[str, Any]:
     return {"version": version(), "scene_text": scene.text, "spacing": scene.discretization.spacing,
-            "stations": list(STATIONS), "ends": ENDS}  # fmt: skip
+            "stations": list(STATIONS), "ends": ends, "averaged": averaged}  # fmt: skip
 
 
 def survey(report: Report, scene: Scene, ends: float, averaged: float) -> tuple[Survey, Simulation]:
@@ -195,15 +198,17 @@ def survey(report: Report, scene: Scene, ends: float, averaged: float) -> tuple[
     measured = Survey(scene.discretization.spacing)
     simulation.boundaries = (*simulation.boundaries, measured)
     path = cache_file("validation", f"{scene.name}-{1e6 * scene.discretization.spacing:.0f}um")
-    facts, begun = _facts(scene), 0
-    if path.is_file():
-        try:
-            kept = Checkpoint.read(path)
-            kept.require(facts, path)
-            simulation.load_state(kept.state)
-            begun = kept.frame
-        except InputError:
-            begun = 0  # of another version: begin again
+    facts, begun = _facts(scene, ends, averaged), 0
+    with contextlib.suppress(InputError):  # none there, or of another run: begin at the beginning
+        kept = Checkpoint.read(path)
+        kept.require(facts, path)
+        simulation.load_state(kept.state)
+        begun = kept.frame
+        console(sys.stderr).print(
+            f"{scene.name}: goes on from {simulation.time:g} s, kept in {path}; delete it to begin "
+            "again",
+            soft_wrap=True,
+        )
     looks = round(ends / LOOK)
     for look in range(begun + 1, looks + 1):
         simulation.advance_to(look * LOOK)
@@ -218,8 +223,10 @@ def survey(report: Report, scene: Scene, ends: float, averaged: float) -> tuple[
 
 
 def _keep(path: Path, checkpoint: Checkpoint) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoint.write(path)
+    """Write a checkpoint; a cache that cannot be written is no error."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        checkpoint.write(path)
 
 
 def nozzle(report: Report, quick: bool) -> None:
@@ -274,7 +281,7 @@ def _hold_flow(report: Report, case: str, means: Means) -> None:
         f"{case}: quarters of the jet at z = 8 mm, r < 2 mm (error: the largest difference over "
         "the axis' speed)",
         f"{sides.min():.3f} to {sides.max():.3f} m/s", "alike",
-        float(np.ptp(sides) / means.axis[row]), 0.03, flows.RESISTING,
+        float(np.ptp(sides) / means.axis[row]), 0.03,
     )  # fmt: skip
 
 
@@ -308,5 +315,5 @@ def _hold_wall_pressure(report: Report, case: str, means: Means) -> None:
             f"{case}: pressure at the wall at z = {z} mm over that at {REFERENCE} mm (error: over "
             f"the {highest} Pa at -63 mm)",
             f"{found:.0f} Pa", f"{pressure} ({deviation}) Pa",
-            abs(found - pressure) / highest, max(2.0 * deviation / highest, 0.1), flows.RESISTING,
+            abs(found - pressure) / highest, max(2.0 * deviation / highest, 0.1),
         )  # fmt: skip

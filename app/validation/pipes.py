@@ -102,7 +102,7 @@ STEADY = (
     (100, 6, 0.10, ""),
     (100, 8, 0.07, ""),
     (100, 20, 0.05, ""),
-    (500, 20, 0.05, flows.RESISTING),
+    (500, 20, 0.05, ""),
 )
 """Reynolds number of the largest speed, spacings across, tolerance of the flow rate, known miss."""
 WATCHED = 0.5

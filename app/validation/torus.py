@@ -164,5 +164,4 @@ def bends(report: Report, quick: bool) -> None:
             "nearer of Ito and White)",
             f"{found:.3f}", f"{low:.3f} to {high:.3f}",
             max(0.0, low / found - 1.0, found / high - 1.0), 0.05,
-            flows.RESISTING if dean > 100 else "",
         )  # fmt: skip

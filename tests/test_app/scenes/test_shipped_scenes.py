@@ -1,9 +1,13 @@
+import math
+
 import msgspec
 import numpy as np
 import pytest
 
 from app.models import MODELS
 from app.scenes.library import delivered_viscosity, find_scene, measure, shipped
+from taichi_sph.derived import derive
+from taichi_sph.geometry.vessel import read_vessel
 from taichi_sph.simulation import Simulation
 
 STEPS = 20
@@ -67,3 +71,10 @@ def test_info_tells_how_viscous_the_blood_of_a_shipped_scene_is_and_of_no_other(
     scene = find_scene("box")
     assert delivered_viscosity(msgspec.structs.replace(scene, text=scene.text + "\n")) is None
     assert delivered_viscosity(msgspec.structs.replace(scene, name="mine")) is None
+
+
+def test_sound_is_fast_enough_for_the_throat_of_a_vessel_that_does_not_branch():
+    scene = find_scene("fda_nozzle")
+    derived = derive(scene, read_vessel(scene), 0, 0)
+    # 2 Q/A of the throat of 4 mm; through the outlet of 12 mm it would be 0.09 m/s.
+    assert derived.quiet_speed == pytest.approx(2.0 * 5.20624e-6 / (math.pi * 2e-3**2), rel=0.01)
